@@ -1,0 +1,303 @@
+"""The integrator ``nil``: unidirectional path tracing along the geodesics of Nil."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.python.ad.integrators.common import ADIntegrator
+
+from . import geometry
+from .camera import Camera
+from .interaction import offset, surface_interaction
+from .quotient import Space
+from .tracer import Cone, Tracer
+
+# Camera samples in one pass: more use no processor better, and memory grows with them.
+PASS_SAMPLES = 2**21
+
+# After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
+# of tolerance. The lobe blurs what lies behind it, so only contacts could tell.
+ROUGH_SPREAD = 0.2
+
+
+class NilIntegrator(ADIntegrator):
+    """Path tracer whose rays are geodesics of Nil, in plain Nil or in the quotient by Γ.
+
+    Parameters: ``max_depth`` (−1), ``rr_depth`` (5) and ``hide_emitters`` (false) as in ``path``;
+    ``twist`` (1); ``quotient`` (true); ``cell_origin`` (0, 0, 0) and ``cell_size`` (1), in scene
+    units; ``tolerance`` (0.25), in pixels; ``max_distance`` of one segment, in cells (12 in the
+    quotient, unlimited in plain Nil). It offers no gradients and no participating media.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(mi.Properties())
+        self.max_depth = _integer(props, "max_depth", -1)
+        if self.max_depth < 0 and self.max_depth != -1:
+            raise RuntimeError('"max_depth" must be set to -1 (infinite) or a value >= 0')
+        self.rr_depth = _integer(props, "rr_depth", 5)
+        if self.rr_depth <= 0:
+            raise RuntimeError('"rr_depth" must be set to a value greater than zero!')
+        self.hide_emitters = _boolean(props, "hide_emitters", False)
+
+        self.quotient = _boolean(props, "quotient", True)
+        self.twist = _number(props, "twist", 1.0)
+        if self.quotient and self.twist != round(self.twist):
+            raise RuntimeError(
+                f'"twist" = {self.twist:g} does not glue the faces of the cube: use an integer '
+                f'such as {math.floor(self.twist)} or {math.ceil(self.twist)}, or set "quotient" '
+                "to false"
+            )
+        self.cell_origin = _point(props, "cell_origin")
+        self.cell_size = _positive(props, "cell_size", 1.0)
+        self.tolerance = _positive(props, "tolerance", 0.25)
+        self.max_distance = math.inf
+        if self.quotient or props.has_property("max_distance"):
+            self.max_distance = _positive(props, "max_distance", 12.0)
+
+    def to_string(self) -> str:
+        return (
+            f"NilIntegrator[\n  twist = {self.twist:g},\n  quotient = {self.quotient},\n"
+            f"  cell_origin = {self.cell_origin},\n  cell_size = {self.cell_size:g},\n"
+            f"  tolerance = {self.tolerance:g},\n  max_distance = {self.max_distance:g},\n"
+            f"  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
+            f"  hide_emitters = {self.hide_emitters}\n]"
+        )
+
+    # ---------------------------------------------------------------- rendering
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Render an image (mi.TensorXf); Mitsuba's entry, see ``mi.render``."""
+        sensor = _sensor(scene, sensor)
+        for _ in self.passes(scene, sensor, seed, spp):
+            pass
+        if not develop:
+            return mi.TensorXf()
+        image = sensor.film().develop()
+        if evaluate:
+            dr.eval(image)
+        return image
+
+    def passes(self, scene, sensor=0, seed=0, spp=0):
+        """Render pass by pass, yielding the samples per pixel that ``sensor``'s film holds so far.
+
+        The first pass is seeded with ``seed``, later ones with `pass_seed`. A pass is as large as
+        `PASS_SAMPLES` allows, but at least one sample per pixel.
+        """
+        sensor = _sensor(scene, sensor)
+        film = sensor.film()
+        spp = spp or sensor.sampler().sample_count()
+        size = film.crop_size()
+        if film.sample_border():
+            size += 2 * film.rfilter().border_size()
+        per_pass = max(1, min(spp, PASS_SAMPLES // max(1, dr.prod(size))))
+
+        view = self._view(scene)
+        camera = Camera(sensor, view.space, self.tolerance)
+        done, index = 0, 0
+        while done < spp:
+            with dr.suspend_grad():
+                # The sampler may round the count up; the last pass is a full one, so that one
+                # kernel does for all.
+                sampler, count = self._prepare_pass(sensor, pass_seed(seed, index), per_pass,
+                                                    first=index == 0)
+                ray, weight, position = self.sample_rays(scene, sensor, sampler)
+                p, v, cone = camera.start(ray, position)
+                radiance, valid = self._trace(view, sampler, ray, p, v, cone, mi.Bool(True))
+                block = film.create_block()
+                block.set_coalesce(block.coalesce() and count >= 4)
+                ADIntegrator._splat_to_block(
+                    block, film, position, value=radiance * weight, weight=1.0,
+                    alpha=dr.select(valid, mi.Float(1), mi.Float(0)), aovs=[],
+                    wavelengths=ray.wavelengths,
+                )
+                film.put_block(block)
+                del sampler, ray, weight, position, p, v, cone, radiance, valid, block
+                film.schedule_storage()
+                dr.eval()
+                dr.sync_thread()
+            done += count
+            index += 1
+            yield done
+
+    def _prepare_pass(self, sensor, seed, spp, first):
+        film = sensor.film()
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(spp)
+        spp = sampler.sample_count()
+        sampler.set_samples_per_wavefront(spp)
+        size = film.crop_size()
+        if film.sample_border():
+            size += 2 * film.rfilter().border_size()
+        sampler.seed(dr.opaque(mi.UInt32, seed), dr.prod(size) * spp)
+        if first:
+            film.prepare([])
+        return sampler, spp
+
+    def sample(self, mode, scene, sampler, ray, active=True, **_):
+        """One sample per ray, for integrators that wrap this one (``moment``, ``aov``).
+
+        They do not say which sensor the ray is from: it is taken for a ray of the scene's first.
+        """
+        view = self._view(scene)
+        camera = Camera(scene.sensors()[0], view.space, self.tolerance)
+        p, v, cone = camera.start(ray, mi.Vector2f(0))
+        # Wrappers shrink the differentials with the sample count; the cone is a whole pixel's.
+        scale = math.sqrt(sampler.sample_count())
+        cone = Cone(cone.width * scale, cone.spread * scale)
+        radiance, valid = self._trace(view, sampler, ray, p, v, cone, mi.Bool(active))
+        return radiance, valid, [], None
+
+    def render_forward(self, *_, **__):
+        raise RuntimeError('the integrator "nil" offers no gradients: render_forward is not available.')
+
+    def render_backward(self, *_, **__):
+        raise RuntimeError(
+            'the integrator "nil" offers no gradients: render_backward is not available.'
+        )
+
+    def _view(self, scene):
+        return View(scene, self)
+
+    # ------------------------------------------------------------- path tracing
+
+    @dr.syntax
+    def _trace(self, view: View, sampler: mi.Sampler, ray: mi.RayDifferential3f, p: mi.Point3f,
+               v: mi.Vector3f, cone: Cone, active: mi.Bool):
+        """Radiance along the geodesics from ``p`` (cells) in frame direction ``v``.
+
+        Returns the radiance and whether the path met anything that makes its pixel opaque.
+        """
+        scene, space, tracer = view.scene, view.space, view.tracer
+        bsdf_ctx = mi.BSDFContext()
+        depth_limit = 0xFFFFFFFF if self.max_depth == -1 else self.max_depth
+
+        # --------------------- Configure loop state ----------------------
+
+        p, v = mi.Point3f(p), mi.Vector3f(v)   # Start of the current segment, cells and frame
+        cone = Cone(cone.width, cone.spread)   # How far off the segment may be
+        depth = mi.UInt32(0)                   # Depth of current vertex
+        L = mi.Spectrum(0)                     # Radiance accumulator
+        β = mi.Spectrum(1)                     # Path throughput weight
+        η = mi.Float(1)                        # Index of refraction
+        active = mi.Bool(active) & (depth_limit > 0)
+        valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+
+        while active:
+            # ------------------- The next vertex -------------------
+
+            if space.quotient:
+                p = mi.Point3f(geometry.wrap(p, space.twist)[0])
+            reach = tracer.reach(p, v)
+            hit = tracer.intersect(p, v, cone, reach, active, ray.time)
+            si = surface_interaction(hit, v, space, ray.wavelengths)
+
+            # ------------------- Direct emission -------------------
+
+            emitter = si.emitter(scene)
+            L += β * emitter.eval(si, active)
+
+            # Continue tracing the path at this point?
+            active_next = (depth + 1 < depth_limit) & si.is_valid()
+            bsdf = si.bsdf()
+
+            # ---------------- BSDF sampling ----------------
+
+            bsdf_sample, bsdf_weight = bsdf.sample(
+                bsdf_ctx, si, sampler.next_1d(), sampler.next_2d(), active_next
+            )
+            v = si.to_world(bsdf_sample.wo)
+            p = offset(si.p, si.n, v, space)
+            β *= bsdf_weight
+            η *= bsdf_sample.eta
+            valid |= active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type,
+                                                           mi.BSDFFlags.Null)
+
+            # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
+            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+            lobe = dr.minimum(dr.rsqrt(dr.pi * dr.maximum(bsdf_sample.pdf, 1e-8)), 1)
+            cone.width = dr.fma(cone.spread, hit.distance, cone.width)
+            cone.spread = dr.select(
+                delta, cone.spread, dr.maximum(cone.spread, view.rough_spread * lobe)
+            )
+
+            # ------------------ Stopping criterion ------------------
+
+            depth[si.is_valid()] += 1
+            β_max = dr.max(mi.unpolarized_spectrum(β))
+
+            # Russian roulette (η² cancels the radiance scaling inside a dielectric)
+            rr_prob = dr.minimum(β_max * dr.square(η), 0.95)
+            rr_active = depth >= self.rr_depth
+            β[rr_active] *= dr.rcp(rr_prob)
+            rr_continue = sampler.next_1d() < rr_prob
+            active = active_next & (~rr_active | rr_continue) & (β_max != 0)
+
+        return dr.select(valid, L, 0), valid
+
+
+class View:
+    """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
+
+    def __init__(self, scene: mi.Scene, integrator: NilIntegrator):
+        self.scene = scene
+        self.space = Space(integrator.twist, integrator.quotient, integrator.cell_origin,
+                           integrator.cell_size)
+        self.tracer = Tracer(scene, self.space, integrator.max_distance)
+        self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
+
+
+def pass_seed(seed: int, index: int) -> int:
+    """Seed of pass number ``index``: ``seed`` itself, then steps of 2³² times the golden ratio."""
+    return (seed + index * 0x9E3779B9) % 2**32
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def _integer(props, name, default):
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise RuntimeError(f'The property "{name}" has the wrong type (expected <integer>).')
+    return value
+
+
+def _boolean(props, name, default):
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        raise RuntimeError(f'The property "{name}" has the wrong type (expected <boolean>).')
+    return value
+
+
+def _number(props, name, default):
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise RuntimeError(f'The property "{name}" has the wrong type (expected <float>).')
+    if not math.isfinite(value):
+        raise RuntimeError(f'"{name}" must be a finite number, and it is {value}')
+    return float(value)
+
+
+def _positive(props, name, default):
+    value = _number(props, name, default)
+    if value <= 0:
+        raise RuntimeError(f'"{name}" must be greater than zero, and it is {value:g}')
+    return value
+
+
+def _point(props, name):
+    value = props.get(name, [0.0, 0.0, 0.0])
+    try:
+        point = [float(value[i]) for i in range(3)]
+    except (TypeError, IndexError, KeyError):
+        raise RuntimeError(
+            f'The property "{name}" has the wrong type (expected <point> or <vector>).'
+        ) from None
+    if not all(map(math.isfinite, point)):
+        raise RuntimeError(f'"{name}" must be finite, and it is {point}')
+    return point
+
+
+def _sensor(scene, sensor):
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor

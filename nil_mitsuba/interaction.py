@@ -1,0 +1,73 @@
+"""Mitsuba's surface interaction, moved from scene coordinates into Nil's orthonormal frame.
+
+In the left-invariant frame (E1, E2, E3) the metric is the identity, so Mitsuba's shading
+mathematics (``Frame3f``, ``wi``, cosines, BSDFs) holds unchanged on frame components.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import geometry
+from .quotient import Space
+from .tracer import Hit
+
+
+def unit_conormal(p: mi.Point3f, n: mi.Normal3f, space: Space) -> mi.Normal3f:
+    """Nil unit normal (frame components) at ``p`` (cells) of a surface with Euclidean normal ``n``.
+
+    A normal is a covector: (nx, ny + k x nz, nz), normalised. A zero normal stays zero.
+    """
+    conormal = mi.Normal3f(geometry.conormal(p, n, space.twist))
+    return conormal * dr.rsqrt(dr.maximum(dr.squared_norm(conormal), 1e-30))
+
+
+def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
+                        wavelengths) -> mi.SurfaceInteraction3f:
+    """Surface interaction of a geodesic's hit: ``p`` in scene coordinates, all directions in frame.
+
+    ``n``, ``sh_frame``, ``dp_du``, ``dp_dv`` and ``wi`` are frame components (Mitsuba computes no
+    ``dn_du``, ``dn_dv`` here), ``t`` is the geodesic's length in scene units. Where nothing was hit, ``wi`` points against the
+    direction in which the segment *started*: environments are looked up by it.
+    """
+    si = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
+    si.wavelengths = wavelengths
+    si.t = dr.select(hit.valid, hit.distance * space.size, dr.inf)
+
+    if not space.flat:
+        p = space.to_cells(si.p)
+        k = space.twist
+        si.dp_du = geometry.to_frame(p, si.dp_du, k)
+        si.dp_dv = geometry.to_frame(p, si.dp_dv, k)
+        si.n = unit_conormal(p, si.n, space)
+
+        # The shading tangent is a vector, the shading normal a covector: they stay orthogonal, but
+        # only one of them keeps its length, and the bitangent follows from both.
+        sh = si.sh_frame
+        s = geometry.to_frame(p, sh.s, k)
+        handedness = dr.dot(dr.cross(sh.n, sh.s), sh.t)
+        n = unit_conormal(p, sh.n, space)
+        s = dr.normalize(dr.fma(-n, dr.dot(n, s), s))
+        t = dr.mulsign(dr.cross(n, s), handedness)
+        si.sh_frame = mi.Frame3f(s, t, n)
+
+    incoming = dr.select(hit.valid, hit.arrival, start_direction)
+    si.wi = dr.select(hit.valid, si.to_local(-incoming), -incoming)
+    return si
+
+
+def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, space: Space) -> mi.Point3f:
+    """Start (cells) of a ray that leaves a surface point ``p`` (scene) in frame direction ``d``.
+
+    The point is moved by Mitsuba's own ray epsilon, to the side that ``d`` points to, along the
+    metric dual of the conormal ``n`` (frame components).
+    """
+    # drjit's machine epsilon × 1500, as Mitsuba's math::RayEpsilon
+    epsilon = 1500 * 2**-24
+    distance = (1 + dr.max(dr.abs(p))) * epsilon
+    normal = dr.mulsign(mi.Vector3f(n), dr.dot(n, d))
+    cells = space.to_cells(p)
+    return cells + mi.Point3f(geometry.from_frame(cells, normal, space.twist)) * (
+        distance / space.size
+    )

@@ -1,0 +1,102 @@
+"""Where a scene sits in Nil, and how a straight chord passes through the glued faces of its cube.
+
+The quotient Nil/Γ is the unit cube with its faces glued by the generators
+(x+1, y, z + k y), (x, y+1, z) and (x, y, z+1) of Γ (VISGRAF TR-19-06, section 4). All three are
+affine, so a straight chord stays straight when it is carried into the neighbouring cell.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def opaque(value):
+    """The value as an array that kernels read from memory, so that they do for any value."""
+    dr.make_opaque(value)
+    return value
+
+
+class Space:
+    """The scene's Nil space: twist, quotient or not, and the cube's place in the scene.
+
+    ``origin`` (scene units) is the group's identity and the cube's lower corner, ``size`` (scene
+    units) the length of its edge. Numbers that vary between renders are opaque, so that kernels
+    are compiled once for all of them.
+    """
+
+    def __init__(self, twist: float, quotient: bool, origin: list[float], size: float):
+        self.quotient = quotient
+        self.flat = twist == 0
+        self.twist = dr.opaque(mi.Float, twist)
+        self.integer_twist = dr.opaque(mi.Int32, round(twist))
+        self.origin = opaque(mi.Point3f(*origin))
+        self.size = dr.opaque(mi.Float, size)
+        # A few units in the last place of the largest scene coordinate near the cube, in cells:
+        # what Mitsuba's float32 arithmetic may lose at the joint of two chords.
+        extent = 1 + max(abs(c) for c in origin) / size
+        self.slack = dr.opaque(mi.Float, 16 * 2**-24 * extent)
+
+    def to_cells(self, p: mi.Point3f) -> mi.Point3f:
+        """Scene coordinates to cell coordinates."""
+        return mi.Point3f((p - self.origin) / self.size)
+
+    def to_scene(self, p: mi.Point3f) -> mi.Point3f:
+        """Cell coordinates to scene coordinates."""
+        return dr.fma(self.size, p, self.origin)
+
+
+def exit_through_face(p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3i]:
+    """Where the segment p + s d, 0 ≤ s ≤ 1, leaves the unit cube.
+
+    Returns s (clipped to ≥ 0; > 1 if it does not leave) and the face as a vector with one entry
+    of ±1. An edge or a corner is left through one face after the other, by steps of length 0.
+    """
+    inf = dr.inf
+    s = [
+        dr.select(d[i] == 0, inf, (dr.select(d[i] > 0, mi.Float(1), 0) - p[i]) / d[i])
+        for i in range(3)
+    ]
+    nearest = dr.minimum(s[0], dr.minimum(s[1], s[2]))
+    on_x = s[0] == nearest
+    on_y = ~on_x & (s[1] == nearest)
+    on_z = ~on_x & ~on_y
+    face = mi.Vector3i(
+        *(
+            dr.select(on, dr.select(d[i] > 0, mi.Int32(1), mi.Int32(-1)), 0)
+            for i, on in enumerate((on_x, on_y, on_z))
+        )
+    )
+    return dr.maximum(nearest, 0), face
+
+
+def through_face(p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, face: mi.Vector3i,
+                 space: Space) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
+    """Carry a point ``p`` on a face, points that belong to it and the deck element into the next cell.
+
+    ``face`` is zero in lanes that stay. Crossing x = 0 or 1 shears z by k y, which can leave
+    [0, 1) on either side whatever the direction of the ray, so z is reduced at once.
+    """
+    fx, fy, fz = (mi.Float(f) for f in face)
+    shear = space.twist * fx
+    q = mi.Point3f(
+        dr.select(face.x == 0, p.x, dr.select(face.x > 0, mi.Float(0), 1)),
+        dr.select(face.y == 0, p.y, dr.select(face.y > 0, mi.Float(0), 1)),
+        dr.select(face.z == 0, dr.fma(-shear, p.y, p.z), dr.select(face.z > 0, mi.Float(0), 1)),
+    )
+    lift = dr.select(face.x == 0, 0, dr.floor(q.z))
+    q.z -= lift
+    moved = [
+        mi.Point3f(o.x - fx, o.y - fy, dr.fma(-shear, o.y, o.z) - fz - lift) for o in others
+    ]
+    g = mi.Vector3i(
+        cell.x + face.x,
+        cell.y + face.y,
+        cell.z + face.z + mi.Int32(lift) + space.integer_twist * cell.x * face.y,
+    )
+    return q, moved, g
+
+
+def multiply_cells(g: mi.Vector3i, h: mi.Vector3i, space: Space) -> mi.Vector3i:
+    """The group product g·h of two deck elements."""
+    return mi.Vector3i(g.x + h.x, g.y + h.y, g.z + h.z + space.integer_twist * g.x * h.y)

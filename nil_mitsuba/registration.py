@@ -1,0 +1,71 @@
+"""Makes the integrator ``nil`` known to every Mitsuba variant, whenever it is set."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import mitsuba as mi
+
+from . import llvm
+
+# Modules that keep types of the current variant, each after those it imports from.
+VARIANT_MODULES = (
+    "nil_mitsuba.quotient",
+    "nil_mitsuba.tracer",
+    "nil_mitsuba.interaction",
+    "nil_mitsuba.camera",
+    "nil_mitsuba.integrator",
+)
+
+WORKING_VARIANT = "llvm_ad_rgb"
+
+
+def install() -> None:
+    """Register ``nil`` in the current variant, if one is set, and in each one set from now on.
+
+    Calling it again changes nothing. Raises ImportError if the current variant needs an LLVM that
+    is not there.
+    """
+    if not any(isinstance(finder, llvm.Guard) for finder in sys.meta_path):
+        sys.meta_path.insert(0, llvm.Guard())
+    if mi.variant() is not None:
+        _register(None, mi.variant())
+    mi.detail.add_variant_callback(_register)  # a set: the same callback is kept once
+
+
+def refusal(variant: str) -> str | None:
+    """One sentence on why `variant` cannot run the integrator, or None if it can."""
+    if variant.startswith("scalar_"):
+        kind = "a scalar variant, which traces one ray at a time in C++"
+    elif variant.endswith("_polarized"):
+        kind = "a polarized variant, and polarization is not supported"
+    else:
+        return None
+    return (
+        f'the integrator "nil" cannot run in {variant} ({kind}): '
+        f'use for example the variant "{WORKING_VARIANT}".'
+    )
+
+
+def _register(_old: str | None, variant: str) -> None:
+    # A variant loaded before this package was imported does not pass by the import guard again.
+    llvm.require(variant)
+
+    sentence = refusal(variant)
+    if sentence:
+
+        def construct(_props):
+            raise RuntimeError(sentence)
+    else:
+        for name in VARIANT_MODULES:
+            if name in sys.modules:
+                importlib.reload(sys.modules[name])
+            else:
+                importlib.import_module(name)
+
+        def construct(props):
+            # Looked up on each call: the class is another one after each reload.
+            return sys.modules["nil_mitsuba.integrator"].NilIntegrator(props)
+
+    mi.register_integrator("nil", construct)

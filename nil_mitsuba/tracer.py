@@ -1,0 +1,274 @@
+"""Geodesic rays against Mitsuba's scene of straight-ray intersections.
+
+A ray is followed along its geodesic by chords short enough for the error that the viewer
+tolerates. A chord that hits tells where to look; the hit itself is found on a short piece of the
+geodesic's tangent line there (Newton's method with Embree as the surface), so that hits lie on the
+geodesic and Mitsuba supplies uv, primitive and curvature for every kind of shape. Where the
+tangent misses what the chord hit (silhouettes, contacts, grazing rays), the chord is cut and tried
+again. Everything in this file is in cell coordinates unless it says "scene".
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import geometry
+from .quotient import Space, exit_through_face, opaque, through_face
+
+
+# Chords keep within this part of the cone: what a chord has missed cannot be seen again, so the
+# error is one-sided, and a quarter leaves the image's mean where it belongs.
+SAGITTA = 0.25
+
+class Cone:
+    """How far off a ray may be: ``width`` + ``spread`` · distance (cells), as a pixel's cone."""
+
+    DRJIT_STRUCT = {"width": mi.Float, "spread": mi.Float}
+
+    def __init__(self, width=0.0, spread=0.0):
+        self.width = mi.Float(width)
+        self.spread = mi.Float(spread)
+
+
+class Hit:
+    """The first surface along a geodesic.
+
+    ``distance`` (cells) is arc length, ``arrival`` the frame direction there, ``cell`` the deck
+    element of the copy that was hit, ``ray`` (scene) and ``preliminary`` what Mitsuba needs to
+    compute its surface interaction.
+    """
+
+    DRJIT_STRUCT = {
+        "valid": mi.Bool,
+        "distance": mi.Float,
+        "arrival": mi.Vector3f,
+        "cell": mi.Vector3i,
+        "ray": mi.Ray3f,
+        "preliminary": mi.PreliminaryIntersection3f,
+    }
+
+    def __init__(self, valid=None, distance=None, arrival=None, cell=None, ray=None,
+                 preliminary=None):
+        self.valid = valid
+        self.distance = distance
+        self.arrival = arrival
+        self.cell = cell
+        self.ray = ray
+        self.preliminary = preliminary
+
+
+def turned(v: mi.Vector3f, angle: mi.Float) -> mi.Vector3f:
+    """A frame direction after its geodesic has turned by ``angle`` = k w t."""
+    s, c = dr.sincos(angle)
+    return mi.Vector3f(dr.fma(v.x, c, -v.y * s), dr.fma(v.y, c, v.x * s), v.z)
+
+
+def hash_to_unit(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
+    """A number in [0, 1) from a ray's bits, the same on every machine."""
+    bits = [dr.reinterpret_array(mi.UInt32, x) for x in (v.x, v.y, p.x)]
+    mixed = (bits[0] * 0x9E3779B1) ^ (bits[1] * 0x85EBCA77) ^ (bits[2] * 0xC2B2AE3D)
+    mixed = (mixed ^ (mixed >> 15)) * 0x2C1B3C6D
+    mixed = (mixed ^ (mixed >> 12)) * 0x297A2D39
+    return mi.Float(mixed >> 9) * 2**-23
+
+
+class Tracer:
+    """Follows geodesics through a scene, in plain Nil or in the quotient."""
+
+    def __init__(self, scene: mi.Scene, space: Space, max_distance: float):
+        self.scene = scene
+        self.space = space
+        self.max_distance = dr.opaque(mi.Float, max_distance)
+        box = scene.bbox()
+        if not box.valid():  # a scene of environment emitters only
+            box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
+        self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
+        self.upper = space.to_cells(opaque(mi.Point3f(box.max)))
+
+    # ------------------------------------------------------------------ lengths
+
+    def reach(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
+        """Arc length (cells) past which the geodesic cannot meet the scene's box any more.
+
+        With B and H the horizontal and symmetric-vertical extent of the box seen from p, a point
+        inside has |Z~| ≤ H and horizontal distance ≤ B, while |Z~| ≥ (|w| + c²/2|w|) t − c B/2|w|
+        along the geodesic; hence t ≤ (2 |w| H + c B)/(1 + w²).
+        """
+        if self.space.quotient:
+            return mi.Float(self.max_distance)
+        far = dr.maximum(dr.abs(self.lower - p), dr.abs(self.upper - p))
+        k = dr.abs(self.space.twist)
+        c = dr.hypot(v.x, v.y)
+        w = dr.abs(v.z)
+        height = far.z + k * far.y * (dr.abs(p.x) + 0.5 * far.x)
+        bound = (2 * w * height + c * dr.hypot(far.x, far.y)) / (1 + w * w)
+        # one part in a thousand and a little more against rounding
+        return dr.minimum(1.001 * bound + 1e-3, self.max_distance)
+
+    def outside(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
+        """Arc length (cells) that certainly does not meet the scene's box; 0 inside it."""
+        k = dr.abs(self.space.twist)
+        gap = dr.maximum(dr.maximum(self.lower - p, p - self.upper), 0)
+        c = dr.hypot(v.x, v.y)
+        # |dz/dt| = |w + k x b| ≤ |w| + k (|x| + c t) c bounds the height gained
+        rise = dr.fma(k * dr.abs(p.x), c, dr.abs(v.z))
+        root = dr.sqrt(dr.fma(rise, rise, 2 * k * c * c * gap.z))
+        climb = 2 * gap.z / dr.maximum(rise + root, 1e-20)
+        return dr.maximum(climb, dr.maximum(gap.x, gap.y) / dr.maximum(c, 1e-20))
+
+    def acceleration(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Vector3f:
+        """Second derivative of the geodesic's coordinates: k (−w b, w a, a b + k x w a)."""
+        k = self.space.twist
+        turn = k * v.z
+        y = turn * v.x
+        return mi.Vector3f(-turn * v.y, y, dr.fma(k * p.x, y, k * v.x * v.y))
+
+    def chord_length(self, v: mi.Vector3f, t: mi.Float, cone: Cone) -> mi.Float:
+        """Chord from arc length t on whose sagitta keeps within the cone at its middle.
+
+        The geodesic's acceleration is k (−w b, w a, a b) in frame components; across the
+        direction its length is |k| c √(w² + a² b²), so the sagitta is h²/8 times that, and
+        h² g/8 = width + spread (t + h/2) is solved for h. a b changes at a rate ≤ |k w| c².
+        """
+        k = dr.abs(self.space.twist)
+        a2, b2, w2 = v.x * v.x, v.y * v.y, v.z * v.z
+        c2 = a2 + b2
+        spread = SAGITTA * cone.spread
+        room = SAGITTA * dr.fma(cone.spread, t, cone.width)
+        c = dr.sqrt(c2)
+
+        def length(ab):
+            g = dr.maximum(k * c * dr.sqrt(dr.fma(ab, ab, w2)), 1e-9)
+            root = dr.sqrt(dr.fma(spread, spread, 2 * g * room))
+            return 2 * (spread + root) / g
+
+        ab = dr.abs(v.x * v.y)
+        h = length(ab)
+        h = length(dr.minimum(dr.fma(k * dr.abs(v.z) * c2, h, ab), 0.5 * c2))
+        # Along more than 1/k the chord is no parabola any more.
+        return dr.minimum(h, dr.rcp(dr.maximum(k, 1e-9)))
+
+    # ------------------------------------------------------------------ tracing
+
+    @dr.syntax
+    def intersect(self, p: mi.Point3f, v: mi.Vector3f, cone: Cone, reach: mi.Float,
+                  active: mi.Bool, time: mi.Float = 0) -> Hit:
+        """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` within ``reach``.
+
+        In the quotient ``p`` lies in the unit cube. The result's distance errs across the
+        geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more.
+        """
+        space, scene = self.space, self.scene
+        k = space.twist
+        quotient = space.quotient
+
+        # The chord in work runs from ``vertex`` (at arc length t0, on the last chord) to ``end``
+        # (at t1, on the geodesic); ``cap`` shortens chords after a failed refinement.
+        vertex, end, base = mi.Point3f(p), mi.Point3f(p), mi.Point3f(p)
+        t0, t1 = mi.Float(0), mi.Float(0)
+        length = mi.Float(0)
+        cap = mi.Float(dr.inf)
+        redo = mi.Bool(False)
+        # Refinement: the tangent at arc length ``at`` is searched over ± ``window``.
+        refining = mi.Bool(False)
+        at, window = mi.Float(0), mi.Float(0)
+        cell = mi.Vector3i(0)
+
+        valid = mi.Bool(False)
+        distance = mi.Float(dr.inf)
+        ray_found = dr.zeros(mi.Ray3f)
+        found = dr.zeros(mi.PreliminaryIntersection3f)
+        active = active & (reach > 0)
+        # Where chords join differs from ray to ray, which turns their error into noise.
+        stretch = dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3)
+
+        while active:
+            # ------------------------ The next piece ------------------------
+            v1 = turned(v, k * v.z * t1)
+            fresh = ~refining & (redo | (t0 >= t1))
+            h = dr.minimum(stretch * self.chord_length(v1, t0, cone), cap)
+            empty = mi.Bool(False)
+            wanted = mi.Float(h)
+            if not quotient:
+                skip = self.outside(vertex, v1)
+                empty = ~redo & (skip > h)
+                h = dr.maximum(h, skip)
+            # A second look starts on the geodesic itself: a step sideways leads there.
+            h = dr.select(redo, 0, dr.minimum(h, reach - t0))
+            target = dr.select(refining, at, dr.select(fresh, t0 + h, t1))
+            point, tangent = geometry.flow(base, v1, target - t1, k)
+
+            base = dr.select(fresh, point, base)
+            t1 = dr.select(fresh, target, t1)
+            # The corners lie outside the curve by 2/3 of the sagitta: the mean error is zero.
+            lift = -(2 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h))
+            end = dr.select(fresh, dr.fma(lift, self.acceleration(point, tangent), point), end)
+            length = dr.select(fresh, h, length)
+            cap = dr.select(fresh & ~redo, 2 * cap, cap)
+            empty &= fresh
+
+            # Chord: vertex + s (end − vertex); tangent: point + s tangent
+            along = mi.Vector3f(end - vertex)
+            s_first, s_last = mi.Float(0), mi.Float(1)
+            velocity = geometry.from_frame(point, tangent, k)
+            along = dr.select(refining, velocity, along)
+            start = dr.select(refining, point, vertex)
+            s_first = dr.select(refining, -dr.minimum(window, at), s_first)
+            s_last = dr.select(refining, dr.minimum(window, reach - at), s_last)
+            leaves = mi.Bool(False)
+            face = mi.Vector3i(0)
+            if quotient:
+                s_face, face = exit_through_face(start, along)
+                s_back, _ = exit_through_face(start, -along)
+                leaves = ~refining & (s_face < s_last)
+                s_last = dr.minimum(s_last, s_face)
+                s_first = dr.maximum(s_first, dr.select(refining, -s_back, 0))
+
+            speed = dr.norm(along)
+            d = dr.select(speed > 0, along / speed, v1)
+            # Pieces overlap by the rounding of their joint, but none reaches behind the start.
+            before = dr.select(t0 > 0, space.slack, 0)
+            o = space.to_scene(dr.fma(along, s_first, start) - before * d)
+            span = (s_last - s_first) * speed + before + space.slack
+            ray = dr.zeros(mi.Ray3f)
+            ray.o, ray.d, ray.maxt, ray.time = o, d, span * space.size, time
+            pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~empty)
+
+            # --------------------------- What it met ---------------------------
+            s = s_first + (pi.t / space.size - before) / dr.maximum(speed, 1e-20)
+            c = dr.hypot(v.x, v.y)
+            bend = dr.abs(k) * c * dr.sqrt(dr.fma(dr.square(v1.x), dr.square(v1.y), v.z * v.z))
+            t_hit = dr.select(refining, at + s, dr.fma(dr.clip(s, 0, 1), t1 - t0, t0))
+            error = bend * dr.select(refining, 0.5 * dr.square(s), 0.125 * dr.square(length))
+            goal = dr.fma(0.004, dr.fma(cone.spread, t_hit, cone.width), 4e-6)
+            accept = pi.valid & (error <= goal)
+            redo = refining & ~pi.valid
+            look = pi.valid & ~accept
+            window = dr.select(
+                look,
+                dr.select(refining, dr.minimum(0.5 * window, 32 * error), 0.25 * length),
+                window,
+            )
+            at = dr.select(look, t_hit, at)
+            missed = ~refining & ~pi.valid
+            cap = dr.select(redo, 0.125 * length, cap)
+
+            valid |= accept
+            distance = dr.select(accept, t_hit, distance)
+            ray_found = dr.select(accept, ray, ray_found)
+            found = dr.select(accept, pi, found)
+
+            # ------------------------------ Go on ------------------------------
+            crossing = dr.fma(along, s_last, vertex)
+            through = missed & leaves
+            t0 = dr.select(missed, dr.select(through, dr.fma(s_last, t1 - t0, t0), t1), t0)
+            vertex = dr.select(missed, dr.select(through, crossing, end), vertex)
+            if quotient:
+                face = dr.select(through, face, 0)
+                vertex, (end, base), cell = through_face(vertex, [end, base], cell, face, space)
+            refining = look
+            active &= ~accept & ~(missed & (t0 >= reach))
+
+        return Hit(valid, distance, turned(v, k * v.z * distance), cell,
+                   ray_found, found)

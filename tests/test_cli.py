@@ -1,0 +1,404 @@
+import re
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from nil_mitsuba import cli, exr
+
+SENSOR = """
+    <sensor type="perspective">
+        <transform name="to_world">
+            <lookat origin="0.5, 0.5, 0.1" target="0.5, 0.5, 1" up="0, 1, 0"/>
+        </transform>
+        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+        <film type="hdrfilm">
+            <integer name="width" value="12"/>
+            <integer name="height" value="8"/>
+            <string name="component_format" value="$format"/>
+        </film>
+    </sensor>
+"""
+LAMP = """
+    <shape type="sphere">
+        <point name="center" x="0.5" y="0.5" z="0.7"/>
+        <float name="radius" value="0.15"/>
+        <emitter type="area"/>
+    </shape>
+"""
+NIL = '<integrator type="nil"><float name="max_distance" value="1"/></integrator>'  # one lamp
+DEFAULTS = '<default name="spp" value="4"/><default name="format" value="float16"/>'
+
+
+def scene(*parts):
+    return f'<scene version="3.0.0">{DEFAULTS}{"".join(parts)}</scene>'
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with a scene in it."""
+    (tmp_path / "scene.xml").write_text(scene(NIL, SENSOR, LAMP))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def command(folder, monkeypatch, capfd):
+    """Runs the command in `folder`: its status, what it printed and its complaints."""
+    resolver, level, threads = mi.file_resolver(), mi.log_level(), dr.thread_count()
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nil-mitsuba", *arguments])
+        mi.set_file_resolver(resolver)
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capfd.readouterr()
+        return stopped.value.code or 0, out, err
+
+    yield run
+    mi.set_file_resolver(resolver)
+    mi.set_log_level(level)
+    dr.set_thread_count(threads)
+    mi.set_variant("llvm_ad_rgb")
+
+
+def read(path):
+    """Header, pixel types and pixels of an EXR file; pixels as a Mitsuba tensor."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header = dict(file.header())
+        types = {name: str(channel.pixels.dtype) for name, channel in file.channels().items()}
+    bitmap = mi.Bitmap(str(path))
+    if bitmap.component_format() != mi.Struct.Type.Float32:
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32)
+    return header, types, mi.TensorXf32(bitmap)
+
+
+# ------------------------------------------------------------------- pictures
+
+
+def test_the_file_holds_what_the_integrator_renders(command):
+    status, out, err = command("render", "scene.xml", "-D", "format=float32", "--seed", "3")
+    assert (status, out) == (0, "scene.exr\n"), err
+    _, types, pixels = read("scene.exr")
+    assert types == {"R": "float32", "G": "float32", "B": "float32"}
+    image = mi.render(mi.load_file("scene.xml", format="float32"), seed=3)
+    assert dr.allclose(pixels, image)
+    assert dr.min(image.array)[0] < 0.1 and dr.max(image.array)[0] > 0.9
+
+
+def test_a_film_of_half_floats_is_written_as_half_floats(command):
+    assert command("render", "scene.xml", "-o", "half.exr")[0] == 0
+    assert set(read("half.exr")[1].values()) == {"float16"}
+
+
+def test_the_file_tells_how_it_was_made(command):
+    command("render", "scene.xml", "--spp", "8", "--seed", "5", "-P", "twist=2")
+    header = read("scene.exr")[0]
+    assert (header["spp"], header["seed"], header["twist"]) == (8, 5, 2)
+    assert (header["quotient"], header["tolerance"]) == ("true", 0.25)
+    assert header["scene"] == "scene.xml"
+    for name in ("nil_mitsuba 0", "Mitsuba 3", "Dr.Jit 1"):
+        assert name in header["software"]
+    assert header["commandLine"].endswith("--seed 5 -P twist=2")
+
+
+def test_the_picture_lies_beside_its_scene(command, folder):
+    (folder / "elsewhere").mkdir()
+    (folder / "elsewhere" / "two.xml").write_text(scene(NIL, SENSOR, LAMP))
+    assert command("render", "elsewhere/two.xml")[1] == "elsewhere/two.exr\n"
+    assert (folder / "elsewhere" / "two.exr").exists()
+
+
+def test_a_png_is_srgb(command, folder):
+    sky = '<emitter type="constant"><float name="radiance" value="0.5"/></emitter>'
+    (folder / "sky.xml").write_text(scene(NIL, SENSOR, sky))
+    status, out, err = command("render", "sky.xml", "--png", "sky.png", "-P", "quotient=false")
+    assert (status, out) == (0, "sky.exr\nsky.png\n"), err
+    value = mi.TensorXu8(mi.Bitmap("sky.png"))[4, 6, 0].array[0]
+    assert value in (187, 188)  # 255 (1.055 · 0.5^(1/2.4) − 0.055) = 187.5
+
+
+def test_seeds_make_pictures_repeatable(command):
+    pictures = []
+    for seed in ("1", "1", "2"):
+        command("render", "scene.xml", "--seed", seed)
+        pictures.append(read("scene.exr")[2])
+    assert dr.allclose(pictures[0], pictures[1])
+    assert not dr.allclose(pictures[0], pictures[2])
+
+
+def test_the_sensor_is_chosen_by_its_number(command, folder):
+    wide = SENSOR.replace('value="12"', 'value="16"')
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR, wide, LAMP))
+    command("render", "scene.xml", "-s", "1")
+    assert read("scene.exr")[2].shape == (8, 16, 3)
+
+
+def test_threads_and_other_variants(command, folder):
+    mi.Bitmap(dr.full(mi.TensorXf, 1, (4, 8, 3))).write("sky.exr")
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR, LAMP, sky))
+    status, _, err = command("render", "scene.xml", "-t", "1", "-m", "llvm_ad_spectral")
+    assert status == 0, err
+    assert dr.thread_count() == 1 and mi.variant() == "llvm_ad_spectral"
+    dr.set_thread_count(2)  # without a worker thread Mitsuba's reader never ends
+    assert read("scene.exr")[0]["variant"] == "llvm_ad_spectral"
+
+
+def test_no_progress_bar_where_no_one_watches(command):
+    assert command("render", "scene.xml")[2] == ""
+
+
+def test_help_and_version_are_no_errors(command):
+    status, out, _ = command("render", "--help")
+    assert status == 0 and "--fit" in out
+    status, out, _ = command("--version")
+    assert status == 0 and out.startswith("nil-mitsuba ")
+
+
+# --------------------------------------------------------- scenes as they are
+
+
+@pytest.mark.parametrize("integrator", ["path", "never_written"])
+def test_another_integrator_is_replaced_before_it_is_built(command, folder, integrator):
+    other = (
+        f'<integrator type="{integrator}"><integer name="max_depth" value="3"/>'
+        '<string name="of_its_own" value="x"/></integrator>'
+    )
+    (folder / "scene.xml").write_text(scene(other, SENSOR, LAMP))
+    status, _, err = command("render", "scene.xml", "-P", "rr_depth=7")
+    assert status == 0
+    assert err == f'scene.xml: the integrator "{integrator}" is replaced by "nil".\n'
+    header = read("scene.exr")[0]
+    assert (header["max_depth"], header["rr_depth"]) == (3, 7)
+
+
+def test_a_scene_without_integrator_is_rendered_with_nil(command, folder):
+    (folder / "scene.xml").write_text(scene(SENSOR, LAMP))
+    status, _, err = command("render", "scene.xml", "-P", "twist=0")
+    assert (status, err) == (0, 'scene.xml has no integrator: rendering with "nil".\n')
+    assert read("scene.exr")[0]["twist"] == 0
+
+
+def test_wrappers_of_nil_stay_and_others_go(command, folder):
+    moment = '<integrator type="moment"><integrator type="{}"/></integrator>'
+    film = SENSOR.replace("$format", "float32")
+    (folder / "nil.xml").write_text(scene(moment.format("nil"), film, LAMP))
+    (folder / "path.xml").write_text(scene(moment.format("path"), film, LAMP))
+
+    status, _, err = command("render", "nil.xml", "-P", "twist=2", "--png", "nil.png")
+    assert (status, err) == (0, "")
+    assert len(read("nil.exr")[1]) > 3
+
+    status, _, err = command("render", "path.xml")
+    assert (status, err) == (0, 'path.xml: the integrator "moment" is replaced by "nil".\n')
+    assert len(read("path.exr")[1]) == 3
+
+
+def test_meshes_includes_and_constants_are_found_from_any_folder(command, folder):
+    place = folder / "a" / "parts"
+    place.mkdir(parents=True)
+    (place / "triangle.obj").write_text("v 0 0 .9\nv 1 0 .9\nv 0 1 .9\nf 1 3 2\n")
+    (place / "mesh.xml").write_text(
+        '<scene version="3.0.0"><shape type="obj"><string name="filename" value="$mesh"/>'
+        '<emitter type="area"/></shape></scene>'
+    )
+    (folder / "a" / "scene.xml").write_text(
+        scene(
+            '<path value="parts"/><default name="mesh" value="none.obj"/>',
+            '<integrator type="path"/><include filename="parts/mesh.xml"/>',
+            SENSOR,
+        )
+    )
+    status, _, err = command("render", "a/scene.xml", "-D", "mesh=triangle.obj", "-D", "spp=16")
+    assert status == 0, err
+    header, _, pixels = read("a/scene.exr")
+    assert header["spp"] == 16
+    assert dr.max(pixels.array)[0] > 0.5
+
+
+def test_fit_puts_the_scene_into_the_cell(command, folder):
+    lamp = LAMP.replace('x="0.5"', 'x="-7"')
+    (folder / "scene.xml").write_text(scene(SENSOR, lamp))
+    status, _, err = command("render", "scene.xml", "--fit")
+    assert status == 0
+    corner, size = re.search(r"cell_origin=(\S+) cell_size=(\S+)", err).groups()
+    x, y, z = map(float, corner.split(","))
+    size = float(size)
+    assert size == pytest.approx(0.3 * (1 + 1e-3), rel=1e-6)
+    assert (x + size / 2, y + size / 2, z + size / 2) == pytest.approx((-7, 0.5, 0.7), rel=1e-6)
+    assert read("scene.exr")[0]["cell_origin"] == corner
+
+    # What --fit prints can be typed in.
+    status, _, _ = command("render", "scene.xml", "-P", f"cell_origin={corner}",
+                           "-P", f"cell_size={size!r}")  # fmt: skip
+    assert (status, read("scene.exr")[0]["cell_origin"]) == (0, corner)
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("3", 3), ("-2", -2), ("0.5", 0.5), ("1e-3", 1e-3), ("true", True), ("False", False),
+     ("abc", "abc"), ("1,2", "1,2")],
+)  # fmt: skip
+def test_properties_have_the_type_they_look_like(rgb, text, value):
+    parsed = cli.parse_value(rgb, text)
+    assert parsed == value and type(parsed) is type(value)
+
+
+def test_three_numbers_are_a_vector(rgb):
+    assert list(cli.parse_value(rgb, "-1,0.5,2")) == [-1, 0.5, 2]
+
+
+# ------------------------------------------------------------------ bad input
+
+
+BAD_MESH = '<shape type="obj"><string name="filename" value="missing.obj"/></shape>'
+BAD_PLUGIN = '<shape type="spere"/>'
+BAD_PROPERTY = '<shape type="sphere"><float name="raduis" value="1"/></shape>'
+
+BAD_SCENES = {
+    "broken XML": ("<scene version='3.0.0'><shape", ["bad.xml"]),
+    "no version": ("<scene/>", ["version"]),
+    "not a scene": ('<shape version="3.0.0" type="sphere"/>', ["<scene>"]),
+    "missing mesh": (scene(NIL, SENSOR, BAD_MESH), ["bad.xml (line", "missing.obj"]),
+    "unknown plugin": (scene(NIL, SENSOR, BAD_PLUGIN), ["bad.xml (line", '"spere" not found']),
+    "unknown property": (scene(NIL, SENSOR, BAD_PROPERTY), ["bad.xml (line", '"raduis"']),
+    "undefined constant": (scene(NIL, SENSOR, LAMP).replace("0.15", "$r"), ["$r"]),
+    "no sensor": (scene(NIL, LAMP), ["no sensor"]),
+    "two integrators": (scene(NIL, NIL, SENSOR, LAMP), ["only one integrator"]),
+}
+
+BAD_ARGUMENTS = {
+    "missing scene": (["nowhere.xml"], 1, ['"nowhere.xml" does not exist']),
+    "a folder": (["."], 1, ["is not a file"]),
+    "no such sensor": (["scene.xml", "-s", "1"], 1, ["no sensor 1", "0 to 0"]),
+    "unused constant": (["scene.xml", "-D", "foo=1"], 1, ["unused", "foo"]),
+    "reserved constant": (["scene.xml", "-D", "filename=1"], 1, ["filename"]),
+    "half a twist": (["scene.xml", "-P", "twist=0.5"], 1, ["twist", "integer", "quotient"]),
+    "no tolerance": (["scene.xml", "-P", "tolerance=0"], 1, ["tolerance"]),
+    "NaN": (["scene.xml", "-P", "cell_size=nan"], 1, ["cell_size"]),
+    "infinity": (["scene.xml", "-P", "max_distance=inf"], 1, ["max_distance"]),
+    "wrong type": (["scene.xml", "-P", "max_depth=1.5"], 1, ["max_depth", "integer"]),
+    "wrong range": (["scene.xml", "-P", "max_depth=-2"], 1, ["max_depth"]),
+    "unknown property": (["scene.xml", "-P", "twits=1"], 1, ["twits", "nil"]),
+    "unknown variant": (["scene.xml", "-m", "llvm_rgb"], 1, ["llvm_rgb", "llvm_ad_rgb"]),
+    "scalar variant": (["scene.xml", "-m", "scalar_rgb"], 1, ["scalar_rgb", '"llvm_ad_rgb"']),
+    "polarized": (["scene.xml", "-m", "llvm_ad_mono_polarized"], 1, ['"llvm_ad_rgb"']),
+    "no folder": (["scene.xml", "-o", "nowhere/a.exr"], 1, ["cannot write", "nowhere"]),
+    "a file as folder": (["scene.xml", "-o", "scene.xml/a.exr"], 1, ["cannot write", "scene.xml"]),
+    "a folder as file": (["scene.xml", "-o", "dir.exr"], 1, ["dir.exr", "folder"]),
+    "not an EXR": (["scene.xml", "-o", "a.jpg"], 2, ["-o", ".exr"]),
+    "not a PNG": (["scene.xml", "--png", "a.jpg"], 2, ["--png", ".png"]),
+    "no samples": (["scene.xml", "--spp", "0"], 2, ["--spp"]),
+    "negative seed": (["scene.xml", "--seed", "-1"], 2, ["--seed"]),
+    "no value": (["scene.xml", "-P", "twist"], 2, ["key=value", "twist"]),
+    "unknown option": (["scene.xml", "--sp", "3", "--foo"], 2, ["--"]),
+    "no scene": ([], 2, ["SCENE.xml"]),
+}
+
+
+def complaint(err):
+    """The one line of complaint; what was said before it is a note on the integrator."""
+    lines = err.splitlines()
+    assert lines[-1].startswith("nil-mitsuba: ") and "Traceback" not in err
+    assert not [line for line in lines[:-1] if line and '"nil"' not in line]
+    assert not re.search(r"\.cpp|\.py", lines[-1])
+    return lines[-1]
+
+
+@pytest.fixture
+def rendering_is_an_error(monkeypatch):
+    def render(*_):
+        raise AssertionError("rendering began")
+
+    monkeypatch.setattr(cli, "_render", render)
+
+
+@pytest.mark.parametrize("name", BAD_SCENES)
+def test_a_bad_scene_gets_one_sentence_before_rendering(
+    command, folder, rendering_is_an_error, name
+):
+    text, fragments = BAD_SCENES[name]
+    (folder / "bad.xml").write_text(text)
+    (folder / "bad.exr").write_text("an earlier picture")
+    status, out, err = command("render", "bad.xml")
+    assert (status, out) == (1, "")
+    line = complaint(err)
+    assert [fragment for fragment in fragments if fragment not in line] == []
+    assert (folder / "bad.exr").read_text() == "an earlier picture"
+    assert sorted(p.name for p in folder.iterdir()) == ["bad.exr", "bad.xml", "scene.xml"]
+
+
+@pytest.mark.parametrize("name", BAD_ARGUMENTS)
+def test_bad_arguments_get_one_sentence_before_rendering(
+    command, folder, rendering_is_an_error, name
+):
+    arguments, expected, fragments = BAD_ARGUMENTS[name]
+    (folder / "dir.exr").mkdir()
+    (folder / "scene.exr").write_text("an earlier picture")
+    status, out, err = command("render", *arguments)
+    assert (status, out) == (expected, "")
+    line = complaint(err)
+    assert [fragment for fragment in fragments if fragment not in line] == []
+    assert (folder / "scene.exr").read_text() == "an earlier picture"
+    assert sorted(p.name for p in folder.iterdir()) == ["dir.exr", "scene.exr", "scene.xml"]
+
+
+def test_fit_needs_something_to_fit(command, folder):
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR))
+    status, _, err = command("render", "scene.xml", "--fit")
+    assert status == 1 and "--fit needs a scene" in complaint(err)
+
+
+def test_a_failed_write_leaves_the_earlier_pictures(command, folder, monkeypatch):
+    for name in ("scene.exr", "scene.png"):
+        (folder / name).write_text("an earlier picture")
+
+    def full(path, *_):
+        open(path, "w").write("half a pict")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(exr, "write_film", full)
+    status, _, err = command("render", "scene.xml", "--png", "scene.png")
+    assert status == 1 and "No space left on device" in complaint(err)
+    assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.png", "scene.xml"]
+    for name in ("scene.exr", "scene.png"):
+        assert (folder / name).read_text() == "an earlier picture"
+
+
+def test_an_interrupted_render_writes_nothing(command, folder, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_render", interrupted)
+    status, _, err = command("render", "scene.xml")
+    assert status == 130 and "interrupted" in complaint(err)
+    assert [p.name for p in folder.iterdir()] == ["scene.xml"]
+
+
+def test_a_traceback_is_there_for_those_who_ask(folder, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["nil-mitsuba", "render", "scene.xml", "-P", "a=1", "-vv"])
+    level = mi.log_level()
+    with pytest.raises(RuntimeError):
+        cli.main()
+    mi.set_log_level(level)
+
+
+def test_mitsubas_messages_become_one_line():
+    nested = (
+        '[parser.cpp:1718] At my scene.xml (line 4, col 4): failed to instantiate integrator '
+        'plugin of type "nil": Traceback (most recent call last):\n'
+        '  File "/x/registration.py", line 66, in construct\n'
+        "    return f(props)\n           ^^^^^^^^\n"
+        "  File \"/x/integrator.py\", line 5, in __init__\n"
+        'RuntimeError: "twist" = 0.5 does not glue'
+    )
+    assert cli.tidy(nested) == (
+        'my scene.xml (line 4, col 4): failed to instantiate integrator plugin of type "nil": '
+        '"twist" = 0.5 does not glue'
+    )
+    listed = "[parser.cpp:111] Found unused parameters:\n  - $a=1\n  - $b=2"
+    assert cli.tidy(listed) == "Found unused parameters: $a=1 $b=2"
