@@ -167,7 +167,8 @@ class Tracer:
         # (at t1, on the geodesic); ``cap`` shortens chords after a failed refinement.
         vertex, end, base = mi.Point3f(p), mi.Point3f(p), mi.Point3f(p)
         t0, t1 = mi.Float(0), mi.Float(0)
-        length = mi.Float(0)
+        # ``scale`` is the longer of this chord and the last: both ends may be off by its sagitta.
+        length, scale = mi.Float(0), mi.Float(0)
         cap = mi.Float(dr.inf)
         redo = mi.Bool(False)
         # Refinement: the tangent at arc length ``at`` is searched over ± ``window``.
@@ -204,6 +205,7 @@ class Tracer:
             # The corners lie outside the curve by 2/3 of the sagitta: the mean error is zero.
             lift = -(2 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h))
             end = dr.select(fresh, dr.fma(lift, self.acceleration(point, tangent), point), end)
+            scale = dr.select(fresh, dr.maximum(h, length), scale)
             length = dr.select(fresh, h, length)
             cap = dr.select(fresh & ~redo, 2 * cap, cap)
             empty &= fresh
@@ -240,24 +242,31 @@ class Tracer:
             c = dr.hypot(v.x, v.y)
             bend = dr.abs(k) * c * dr.sqrt(dr.fma(dr.square(v1.x), dr.square(v1.y), v.z * v.z))
             t_hit = dr.select(refining, at + s, dr.fma(dr.clip(s, 0, 1), t1 - t0, t0))
-            error = bend * dr.select(refining, 0.5 * dr.square(s), 0.125 * dr.square(length))
+            # A step sideways has no sagitta, but its start was off the geodesic.
+            sideways = length == 0
+            error = bend * dr.select(refining, 0.5 * dr.square(s), 0.125 * dr.square(scale))
+            error = dr.select(sideways & ~refining, dr.inf, error)
             goal = dr.fma(0.004, dr.fma(cone.spread, t_hit, cone.width), 4e-6)
             accept = pi.valid & (error <= goal)
             redo = refining & ~pi.valid
             look = pi.valid & ~accept
             window = dr.select(
                 look,
-                dr.select(refining, dr.minimum(0.5 * window, 32 * error), 0.25 * length),
+                dr.select(refining, dr.minimum(0.5 * window, 32 * error),
+                          dr.select(sideways, 2 * cap, 0.25 * scale)),
                 window,
             )
             at = dr.select(look, t_hit, at)
             missed = ~refining & ~pi.valid
-            cap = dr.select(redo, 0.125 * length, cap)
+            cap = dr.select(redo, 0.125 * scale, cap)
 
+            # What a step sideways has met stays where the tangent there finds nothing better.
+            keep = accept | (look & sideways & ~refining)
+            distance = dr.select(keep, t_hit, distance)
+            ray_found = dr.select(keep, ray, ray_found)
+            found = dr.select(keep, pi, found)
+            accept |= redo & sideways
             valid |= accept
-            distance = dr.select(accept, t_hit, distance)
-            ray_found = dr.select(accept, ray, ray_found)
-            found = dr.select(accept, pi, found)
 
             # ------------------------------ Go on ------------------------------
             crossing = dr.fma(along, s_last, vertex)
