@@ -252,7 +252,7 @@ class Tracer:
             look = pi.valid & ~accept
             window = dr.select(
                 look,
-                dr.select(refining, dr.minimum(0.5 * window, 32 * error),
+                dr.select(refining, dr.minimum(0.5 * window, 256 * error),
                           dr.select(sideways, 2 * cap, 0.25 * scale)),
                 window,
             )
