@@ -11,7 +11,8 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
-from .quotient import Space
+from .lights import Lights
+from .quotient import Space, multiply_cells
 from .tracer import Cone, Tracer
 
 # Camera samples in one pass: more use no processor better, and memory grows with them.
@@ -20,6 +21,10 @@ PASS_SAMPLES = 2**21
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
 # of tolerance. The lobe blurs what lies behind it, so only contacts could tell.
 ROUGH_SPREAD = 0.2
+
+
+# Mitsuba's math::ShadowEpsilon: a shadow ray ends this part of its length before the light.
+SHADOW_EPSILON = 10 * 1500 * 2**-24
 
 
 class NilIntegrator(ADIntegrator):
@@ -52,8 +57,10 @@ class NilIntegrator(ADIntegrator):
         self.cell_origin = _point(props, "cell_origin")
         self.cell_size = _positive(props, "cell_size", 1.0)
         self.tolerance = _positive(props, "tolerance", 0.25)
+        # Tests switch emitter sampling off: estimates are then exact where furnaces are.
+        self.emitter_sampling = True
         self.max_distance = math.inf
-        if self.quotient or props.has_property("max_distance"):
+        if self.quotient or "max_distance" in props:
             self.max_distance = _positive(props, "max_distance", 12.0)
 
     def to_string(self) -> str:
@@ -86,6 +93,7 @@ class NilIntegrator(ADIntegrator):
         `PASS_SAMPLES` allows, but at least one sample per pixel.
         """
         sensor = _sensor(scene, sensor)
+        seed = int(seed[0]) if dr.is_array_v(seed) else int(seed)
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         size = film.crop_size()
@@ -170,6 +178,8 @@ class NilIntegrator(ADIntegrator):
         Returns the radiance and whether the path met anything that makes its pixel opaque.
         """
         scene, space, tracer = view.scene, view.space, view.tracer
+        lights = view.lights
+        sampling = self.emitter_sampling and lights.exist
         bsdf_ctx = mi.BSDFContext()
         depth_limit = 0xFFFFFFFF if self.max_depth == -1 else self.max_depth
 
@@ -184,29 +194,69 @@ class NilIntegrator(ADIntegrator):
         active = mi.Bool(active) & (depth_limit > 0)
         valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
 
-        while active:
-            # ------------------- The next vertex -------------------
+        # Variables caching information from the previous bounce
+        vertex_prev     = mi.Point3f(p)        # Its position (cells)
+        bsdf_pdf_prev   = mi.Float(1)
+        bsdf_delta_prev = mi.Bool(True)
+        spent           = mi.Float(0)          # Length of the camera segment before hidden lights
 
+        if self.hide_emitters:
+            p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, active)
+
+        while active:
+            # --------------------- The next vertex ---------------------
+
+            home = mi.Vector3i(0)
             if space.quotient:
-                p = mi.Point3f(geometry.wrap(p, space.twist)[0])
-            reach = tracer.reach(p, v)
-            hit = tracer.intersect(p, v, cone, reach, active, ray.time)
+                p, home = geometry.wrap(p, space.twist)
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v) - spent, active, ray.time)
             si = surface_interaction(hit, v, space, ray.wavelengths)
 
-            # ------------------- Direct emission -------------------
+            # --------------------- Direct emission ---------------------
 
             emitter = si.emitter(scene)
-            L += β * emitter.eval(si, active)
+            Le = emitter.eval(si, active)
+            if sampling:
+                # A light that emitter sampling could have drawn is shared with it
+                lit = active & ~bsdf_delta_prev & (emitter != None)  # noqa: E711
+                image = multiply_cells(home, hit.cell, space)
+                em_pdf = lights.pdf(hit, si, emitter, vertex_prev, v, image, lit)
+                Le *= dr.select(lit, mis_weight(bsdf_pdf_prev, em_pdf), 1)
+            L += β * Le
 
             # Continue tracing the path at this point?
             active_next = (depth + 1 < depth_limit) & si.is_valid()
             bsdf = si.bsdf()
+            width = dr.fma(cone.spread, hit.distance, cone.width)
 
-            # ---------------- BSDF sampling ----------------
+            # --------------------- Emitter sampling ---------------------
 
-            bsdf_sample, bsdf_weight = bsdf.sample(
-                bsdf_ctx, si, sampler.next_1d(), sampler.next_2d(), active_next
+            wo = mi.Vector3f(0, 0, 1)
+            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            light = None
+            if sampling:
+                light = lights.sample(si, sampler, active_em)
+                active_em &= dr.any(light.weight != 0)
+                wo = si.to_local(light.direction)
+
+            # ------ Evaluate BSDF * cos(theta) and sample direction -------
+
+            bsdf_val, bsdf_pdf, bsdf_sample, bsdf_weight = bsdf.eval_pdf_sample(
+                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d(), active_next
             )
+
+            # --------------- Emitter sampling contribution ----------------
+
+            if sampling:
+                mis_em = dr.select(light.delta, 1, mis_weight(light.pdf, bsdf_pdf))
+                Lr_dir = β * bsdf_val * light.weight * mis_em
+                active_em &= dr.any(Lr_dir != 0)
+                spread = dr.select(light.delta, cone.spread, view.rough_spread)
+                active_em &= self._visible(view, si, light, Cone(width, spread), active_em)
+                L += dr.select(active_em, Lr_dir, 0)
+
+            # ----------------------- BSDF sampling -----------------------
+
             v = si.to_world(bsdf_sample.wo)
             p = offset(si.p, si.n, v, space)
             β *= bsdf_weight
@@ -214,15 +264,20 @@ class NilIntegrator(ADIntegrator):
             valid |= active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type,
                                                            mi.BSDFFlags.Null)
 
+            # Information about the current vertex needed by the next iteration
+            vertex_prev = space.to_cells(si.p)
+            bsdf_pdf_prev = bsdf_sample.pdf
+            bsdf_delta_prev = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+            spent = mi.Float(0)
+
             # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
-            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
             lobe = dr.minimum(dr.rsqrt(dr.pi * dr.maximum(bsdf_sample.pdf, 1e-8)), 1)
-            cone.width = dr.fma(cone.spread, hit.distance, cone.width)
+            cone.width = width
             cone.spread = dr.select(
-                delta, cone.spread, dr.maximum(cone.spread, view.rough_spread * lobe)
+                bsdf_delta_prev, cone.spread, dr.maximum(cone.spread, view.rough_spread * lobe)
             )
 
-            # ------------------ Stopping criterion ------------------
+            # --------------------- Stopping criterion ---------------------
 
             depth[si.is_valid()] += 1
             β_max = dr.max(mi.unpolarized_spectrum(β))
@@ -236,6 +291,44 @@ class NilIntegrator(ADIntegrator):
 
         return dr.select(valid, L, 0), valid
 
+    def _visible(self, view, si, light, cone, active):
+        """Whether nothing stands between a surface and the light drawn there."""
+        space, tracer = view.space, view.tracer
+        start = offset(si.p, si.n, light.direction, space)
+        if space.quotient:
+            start = geometry.wrap(start, space.twist)[0]
+        # Mitsuba's own margin before the light
+        reach = dr.minimum(light.distance * (1 - SHADOW_EPSILON),
+                           tracer.reach(start, light.direction))
+        blocked = tracer.intersect(start, light.direction, cone, reach, active, si.time)
+        return ~blocked.valid
+
+    @dr.syntax
+    def _beyond_lights(self, view, time, p, v, cone, active):
+        """Where a camera ray goes on behind the area lights that it meets first."""
+        space, tracer = view.space, view.tracer
+        spent = mi.Float(0)
+        active = mi.Bool(active)
+        while active:
+            if space.quotient:
+                p = mi.Point3f(geometry.wrap(p, space.twist)[0])
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v) - spent, active, time)
+            si = surface_interaction(hit, v, space, mi.Color0f())
+            active &= hit.valid & (si.shape.emitter() != None)  # noqa: E711
+            p = dr.select(active, offset(si.p, si.n, hit.arrival, space), p)
+            v = dr.select(active, hit.arrival, v)
+            cone.width = dr.select(active, dr.fma(cone.spread, hit.distance, cone.width),
+                                   cone.width)
+            spent = dr.select(active, spent + hit.distance, spent)
+        return p, v, cone, spent
+
+
+def mis_weight(pdf_a, pdf_b):
+    """Weight of a sample from density ``pdf_a`` by the power heuristic; 0 where both are 0."""
+    a2 = dr.square(pdf_a)
+    w = a2 / dr.fma(pdf_b, pdf_b, a2)
+    return dr.select(dr.isfinite(w), w, 0)
+
 
 class View:
     """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
@@ -245,6 +338,7 @@ class View:
         self.space = Space(integrator.twist, integrator.quotient, integrator.cell_origin,
                            integrator.cell_size)
         self.tracer = Tracer(scene, self.space, integrator.max_distance)
+        self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
 
 

@@ -28,6 +28,7 @@ class Space:
     def __init__(self, twist: float, quotient: bool, origin: list[float], size: float):
         self.quotient = quotient
         self.flat = twist == 0
+        self.twist_number = twist
         self.twist = dr.opaque(mi.Float, twist)
         self.integer_twist = dr.opaque(mi.Int32, round(twist))
         self.origin = opaque(mi.Point3f(*origin))

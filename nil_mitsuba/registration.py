@@ -15,6 +15,7 @@ VARIANT_MODULES = (
     "nil_mitsuba.tracer",
     "nil_mitsuba.interaction",
     "nil_mitsuba.camera",
+    "nil_mitsuba.lights",
     "nil_mitsuba.integrator",
 )
 

@@ -1,0 +1,416 @@
+"""Emitter sampling along geodesics: which light, which of its images, which connecting geodesic.
+
+A point on an area light is joined by the minimising geodesic and weighted against BSDF sampling. A
+point-like light is reached by every geodesic that joins it. In the quotient every light has an
+image in every cell; one is chosen with a probability that follows the light it can bring.
+Environments and directional lights are direction fields in the frame, read where a segment starts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from . import geometry
+from .interaction import unit_conormal
+from .quotient import Space
+from .tracer import Hit
+
+# Emitters that have a meaning in Nil, by the name of their class. (Mitsuba itself samples no
+# directionalarea light and gives it no radiance: in a path tracer it is dark, here too.)
+AREA = ("AreaLight", "DirectionalArea")
+POINT = ("PointLight", "SpotLight", "Projector")
+DIRECTIONAL = ("DirectionalEmitter",)
+ENVIRONMENT = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter", "SunskyEmitter",
+               "TimedSunskyEmitter")
+
+
+class LightSample:
+    """Light that may arrive at a vertex.
+
+    ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
+    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with
+    respect to solid angle, 0 for ``delta`` light, which no other technique finds.
+    """
+
+    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum,
+                    "pdf": mi.Float, "delta": mi.Bool}
+
+    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None):
+        self.direction = direction
+        self.distance = distance
+        self.weight = weight
+        self.pdf = pdf
+        self.delta = delta
+
+
+class Images:
+    """Chooses one of the images g·q, g in Γ, of a point q for a receiver p, both in the unit cube.
+
+    The light that an image brings goes with 1/A, A its area density. Seen from p, the image has
+    the horizontal offset (x, y) and the symmetric height z. With 1/A ~ 1/(r² + z²) near p, and
+    A growing like k² r⁴ far off, x is drawn from a density ~ 1/(s + |x|), y from 1/√(s² + x² + y²)
+    and z from a Cauchy density as wide as r (1 + k r/6), all cut off where an image is certainly
+    beyond ``max_distance``. An image's probability is that of its own unit interval: differences
+    of closed-form distribution functions. The nearest image gets a share of its own.
+    """
+
+    # Half a cell: below, an image's interval does not tell 1/A from a constant.
+    SOFTENING = 0.5
+    # 1/A of the nearest image against the sum over all others, ~ 4π × a few cells of free path.
+    NEAREST = 30
+
+    def __init__(self, space: Space, max_distance: float):
+        k = abs(space.twist_number)
+        self.space = space
+        self.radius = dr.opaque(mi.Float, max_distance + 0.5)
+        # |Z~| ≤ T + k T² (u − sin u)/2u², and the last factor is below 0.16
+        self.height = dr.opaque(mi.Float, max_distance * (1 + 0.16 * k * max_distance) + 0.5)
+
+    def _height_offset(self, p, q, gx, gy):
+        """Symmetric height of g·q seen from p, without its integer part g_z."""
+        k = self.space.twist
+        x, y = gx + q.x - p.x, gy + q.y - p.y
+        return q.z - p.z + k * (gx * q.y - p.x * y - 0.5 * x * y), x, y
+
+    def _scales(self, x, y):
+        s = self.SOFTENING
+        rho = dr.sqrt(dr.fma(x, x, s * s))
+        r = dr.sqrt(dr.fma(y, y, dr.square(rho)))
+        return rho, r * dr.fma(dr.abs(self.space.twist) / 6, r, 1)
+
+    def _nearest(self, p, q):
+        gx, gy = -dr.round(q.x - p.x), -dr.round(q.y - p.y)
+        offset, x, y = self._height_offset(p, q, gx, gy)
+        gz = -dr.round(offset)
+        square = dr.square(x) + dr.square(y) + dr.square(offset + gz)
+        return mi.Vector3i(gx, gy, gz), dr.rcp(dr.fma(self.NEAREST, square, 1))
+
+    def choose(self, p: mi.Point3f, q: mi.Point3f, u1: mi.Float, u2: mi.Point2f
+               ) -> tuple[mi.Vector3i, mi.Float]:
+        """A deck element and its probability."""
+        s, R, Z = self.SOFTENING, self.radius, self.height
+        near, share = self._nearest(p, q)
+        take_near = u1 < share
+        u1 = (u1 - share) / (1 - share)
+        u1, u2, u3 = (2 * u - 1 for u in (u1, u2.x, u2.y))
+
+        x = dr.copysign(s * (dr.exp(dr.abs(u1) * dr.log(1 + R / s)) - 1), u1)
+        gx = dr.round(x - (q.x - p.x))
+        _, dx, _ = self._height_offset(p, q, gx, 0)
+        rho, _ = self._scales(dx, 0)
+        y = rho * dr.sinh(u2 * dr.asinh(R / rho))
+        gy = dr.round(y - (q.y - p.y))
+        offset, dx, dy = self._height_offset(p, q, gx, gy)
+        _, sigma = self._scales(dx, dy)
+        z = sigma * dr.tan(u3 * dr.atan(Z / sigma))
+        gz = dr.round(z - offset)
+
+        g = dr.select(take_near, near, mi.Vector3i(gx, gy, gz))
+        return g, self.probability(p, q, g)
+
+    def probability(self, p: mi.Point3f, q: mi.Point3f, g: mi.Vector3i) -> mi.Float:
+        """Probability with which `choose` draws the deck element ``g``."""
+        s, R, Z = self.SOFTENING, self.radius, self.height
+        near, share = self._nearest(p, q)
+        gx, gy, gz = (mi.Float(c) for c in g)
+        offset, x, y = self._height_offset(p, q, gx, gy)
+        z = offset + gz
+        rho, sigma = self._scales(x, y)
+
+        def interval(f, t, bound):
+            return f(dr.clip(t + 0.5, -bound, bound)) - f(dr.clip(t - 0.5, -bound, bound))
+
+        def in_x(t):
+            return dr.copysign(dr.log(1 + dr.abs(t) / s), t)
+
+        far = (
+            interval(in_x, x, R) / (2 * dr.log(1 + R / s))
+            * interval(lambda t: dr.asinh(t / rho), y, R) / (2 * dr.asinh(R / rho))
+            * interval(lambda t: dr.atan(t / sigma), z, Z) / (2 * dr.atan(Z / sigma))
+        )
+        is_near = (g.x == near.x) & (g.y == near.y) & (g.z == near.z)
+        return dr.fma(1 - share, far, dr.select(is_near, share, 0))
+
+
+class Lights:
+    """The emitters of a scene, seen from points in Nil."""
+
+    def __init__(self, scene: mi.Scene, space: Space, max_distance: float):
+        self.scene = scene
+        self.space = space
+        self.max_distance = max_distance
+        emitters = scene.emitters()
+        names = [emitter.class_name() for emitter in emitters]
+        for emitter, name in zip(emitters, names):
+            if name not in AREA + POINT + DIRECTIONAL + ENVIRONMENT:
+                raise RuntimeError(
+                    f'the integrator "nil" has no meaning for the emitter "{name}"'
+                    f'{f" ({emitter.id()})" if emitter.id() else ""}: use area, point, spot, '
+                    "projector, directional, constant, envmap or sunsky."
+                )
+        self.has_area = "AreaLight" in names
+        self.has_point = any(name in POINT for name in names)
+        self.has_infinite = any(name in DIRECTIONAL + ENVIRONMENT for name in names)
+        self.exist = self.has_area or self.has_point or self.has_infinite
+        varying = [mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+                   for emitter, name in zip(emitters, names) if name == "AreaLight"]
+        self.has_textured_area = any(varying)
+        self.has_plain_area = not all(varying)
+
+        weights = [emitter.sampling_weight() for emitter in emitters]
+        self.uniform = all(weight == weights[0] for weight in weights)
+        self.pmf = 1 / len(emitters) if self.uniform and emitters else 0
+        self.weight_scale = 1 / sum(weights) if weights and not self.uniform else 0
+        if self.has_point:
+            self.positions = self._point_positions(emitters, names)
+        self.images = Images(space, max_distance) if space.quotient else None
+
+    def _point_positions(self, emitters, names):
+        """Positions (cells) of the point-like emitters, by their index among all emitters."""
+        at = [mi.Point3f(0)] * len(emitters)
+        for i, (emitter, name) in enumerate(zip(emitters, names)):
+            if name in POINT:
+                # Mitsuba tells the position of every kind in a direction sample.
+                reference = dr.zeros(mi.Interaction3f)
+                sample, _ = emitter.sample_direction(reference, mi.Point2f(0.5))
+                p = self.space.to_cells(mi.Point3f(sample.p))
+                if self.space.quotient:
+                    p = mi.Point3f(geometry.wrap(p, self.space.twist)[0])
+                at[i] = p
+        columns = [mi.Float([p[axis][0] for p in at]) for axis in range(3)]
+        return mi.Point3f(*columns)
+
+    # ---------------------------------------------------------------- sampling
+
+    def sample(self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Bool
+               ) -> LightSample:
+        """Draw light that may arrive at a surface; visibility is left to the caller."""
+        scene, space = self.scene, self.space
+        p = space.to_cells(si.p)
+        index, weight, _ = scene.sample_emitter(sampler.next_1d(), active)
+        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
+        u = sampler.next_2d()
+        image_u1, image_u2 = mi.Float(0), mi.Point2f(0)
+        if space.quotient and (self.has_area or self.has_point):
+            image_u1, image_u2 = sampler.next_1d(), sampler.next_2d()
+
+        kinds = self.has_area + self.has_point + self.has_infinite
+        flags = emitter.flags() if kinds > 1 else None
+
+        def among(flag):
+            return active if kinds == 1 else active & mi.has_flag(flags, flag)
+
+        sample = LightSample(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Spectrum(0), mi.Float(0),
+                             mi.Bool(False))
+        if self.has_infinite:
+            lit = among(mi.EmitterFlags.Infinite)
+            found = self._sample_infinite(emitter, si, u, lit)
+            sample = dr.select(lit, found, sample)
+        if self.has_area:
+            lit = among(mi.EmitterFlags.Surface)
+            found = self._sample_area(emitter, si, p, u, image_u1, image_u2, lit)
+            sample = dr.select(lit, found, sample)
+        if self.has_point:
+            lit = among(mi.EmitterFlags.DeltaPosition)
+            position = dr.gather(mi.Point3f, self.positions, index, lit)
+            found = self._sample_point(emitter, position, si, p, u.x, image_u1, image_u2, lit)
+            sample = dr.select(lit, found, sample)
+        sample.weight *= weight
+        sample.pdf /= weight
+        return sample
+
+    def _sample_infinite(self, emitter, si, u, active):
+        ds, weight = emitter.sample_direction(si, u, active)
+        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), weight & (ds.pdf > 0),
+                           dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta))
+
+    def _image_of(self, p, q, u1, u2):
+        """An image (cells) of the point ``q`` of the unit cube, and its probability."""
+        if not self.space.quotient:
+            return q, mi.Float(1)
+        g, probability = self.images.choose(p, q, u1, u2)
+        return mi.Point3f(geometry.multiply(mi.Point3f(g), q, self.space.twist)), probability
+
+    def _in_cube(self, q):
+        if not self.space.quotient:
+            return mi.Bool(True)
+        return dr.all((q >= 0) & (q <= 1))
+
+    def _sample_area(self, emitter, si, p, u, u1, u2, active):
+        space = self.space
+        ps, area = emitter.sample_position(si.time, u, active)
+        q = space.to_cells(ps.p)
+        active = active & self._in_cube(q) & (area > 0)
+        image, probability = self._image_of(p, q, u1, u2)
+        way = geometry.connect(p, image, space.twist)
+        direction, arrival = mi.Vector3f(way.direction), mi.Vector3f(way.arrival)
+        n = mi.Normal3f(geometry.conormal(q, ps.n, space.twist))
+        stretch = dr.norm(n)
+        cosine = -dr.dot(n, arrival) / stretch
+
+        # Radiance where the emitter is seen from its front
+        at_light = mi.SurfaceInteraction3f(ps, si.wavelengths)
+        at_light.shape = emitter.get_shape()
+        at_light.wi = mi.Vector3f(0, 0, 1)
+        radiance = emitter.eval(at_light, active)
+        density = way.area_density * dr.square(space.size)  # scene units
+        pdf = probability * density / (area * stretch * cosine)
+        reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
+        pdf = dr.select(reached, pdf, 0)
+        return LightSample(direction, way.distance,
+                           dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False))
+
+    def _sample_point(self, emitter, q, si, p, u, u1, u2, active):
+        space = self.space
+        image, probability = self._image_of(p, q, u1, u2)
+        way = geometry.connect(p, image, space.twist)
+        direction, arrival = mi.Vector3f(way.direction), mi.Vector3f(way.arrival)
+        distance, density = mi.Float(way.distance), mi.Float(way.area_density)
+        turns = abs(space.twist_number) * self.max_distance / (2 * math.pi)
+        if turns >= 1:
+            # Half of the samples go to the minimising geodesic where there may be others.
+            zeta = dr.abs(space.twist) * dr.abs(_symmetric_height(p, image, space.twist))
+            count = dr.minimum(dr.floor(zeta / (2 * dr.pi)), min(turns, 2**24))
+            further = (count > 0) & (u >= 0.5)
+            v = dr.select(further, 2 * u - 1, 0) * count
+            m = dr.minimum(dr.floor(v), count - 1) + 1
+            second = (v - dr.floor(v)) >= 0.5
+            other = further_geodesic(p, image, space.twist, m, second)
+            direction = dr.select(further, other[0], direction)
+            arrival = dr.select(further, other[1], arrival)
+            distance = dr.select(further, other[2], distance)
+            density = dr.select(further, other[3], density)
+            probability *= dr.select(further, 0.25 / dr.maximum(count, 1),
+                                     dr.select(count > 0, 0.5, 1))
+
+        # One scene unit before the light on the geodesic's last direction: what the emitter sends
+        # there is its intensity.
+        reference = dr.zeros(mi.Interaction3f)
+        light = emitter.sample_direction(reference, mi.Point2f(0.5), active)[0].p
+        reference.p = light - arrival
+        reference.wavelengths, reference.time = si.wavelengths, si.time
+        ds, intensity = emitter.sample_direction(reference, mi.Point2f(0.5), active)
+        density = dr.abs(density) * dr.square(space.size)
+        reached = active & (density > 0) & (distance <= self.max_distance) & (ds.pdf > 0)
+        weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
+        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True))
+
+    # ------------------------------------------------------------------ weights
+
+    def pdf(self, hit: Hit, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr, p: mi.Point3f,
+            v: mi.Vector3f, g: mi.Vector3i, active: mi.Bool) -> mi.Float:
+        """Solid-angle density with which `sample` at ``p`` (cells) draws the light just found.
+
+        ``v``: frame direction in which the segment started; ``g``: deck element of the image that
+        was hit, relative to the cell of ``p``. 0 where `sample` could not have drawn it.
+        """
+        result = mi.Float(0)
+        if self.has_area:
+            lit = active & hit.valid
+            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, g, lit), result)
+        environment = self.scene.environment()
+        if environment is not None:
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.d = v
+            lit = active & ~hit.valid
+            pdf = environment.pdf_direction(dr.zeros(mi.Interaction3f), ds, lit)
+            result = dr.select(lit, pdf, result)
+        if self.uniform:
+            return result * self.pmf
+        return result * emitter.sampling_weight() * self.weight_scale
+
+    def _pdf_area(self, hit, si, emitter, p, g, active):
+        space = self.space
+        lit = active & (emitter != None)  # noqa: E711 - an array of pointers
+        q = space.to_cells(si.p)
+        # Density on the surface per unit of coordinate area
+        per_area = mi.Float(0)
+        if self.has_plain_area:
+            ps = dr.zeros(mi.PositionSample3f)
+            ps.p, ps.n, ps.uv = si.p, si.n, si.uv
+            per_area = si.shape.pdf_position(ps, lit)
+        if self.has_textured_area:
+            # Per solid angle at unit distance, face to face: per unit of area
+            varying = lit
+            if self.has_plain_area:
+                varying &= mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.uv, ds.dist, ds.n, ds.d = si.uv, 1, mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, -1)
+            textured = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, varying)
+            per_area = dr.select(varying, textured, per_area)
+
+        density = geometry.area_density(hit.distance, hit.arrival.z, space.twist)
+        density *= dr.square(space.size)
+        # The conormal's length from the Nil unit normal: |N| = 1/|n − k x nz e1·…| of its inverse
+        back = mi.Vector3f(si.n.x, si.n.y - space.twist * q.x * si.n.z, si.n.z)
+        stretch = dr.rcp(dr.norm(back))
+        cosine = dr.abs(dr.dot(si.n, hit.arrival))
+        half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance
+        pdf = per_area * density / (stretch * cosine)
+        if space.quotient:
+            pdf *= self.images.probability(p, q, g)
+        return dr.select(lit & (half_turn < dr.pi) & (cosine > 0), pdf, 0)
+
+
+def _symmetric_height(p, q, twist):
+    """Height of q over p in the symmetric coordinate, by which geodesics wind round a fibre."""
+    return q.z - p.z - 0.5 * twist * (p.x + q.x) * (q.y - p.y)
+
+
+def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float, second: mi.Bool
+                     ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
+    """The first or ``second`` geodesic from p to q (cells) whose half turn is in (mπ, (m+1)π).
+
+    There 2v + R² μ(v) is convex with poles at both ends, so it meets ζ twice or not at all.
+    Returns direction, arrival, distance and signed area density; distance is infinite if there is
+    none. The minimum and the root are bisected in the sign of smooth functions.
+    """
+    k = dr.abs(twist)
+    dx, dy = q.x - p.x, q.y - p.y
+    height = _symmetric_height(p, q, twist) * dr.sign(twist)
+    zeta = k * dr.abs(height)
+    r2 = dr.fma(dx, dx, dy * dy)
+    R2 = dr.maximum(0.25 * dr.square(k) * r2, 1e-12)
+    low = dr.pi * m
+
+    def bisect(lower, upper, rises):
+        for _ in range(22):  # 3 / 2²² is below the rounding of v
+            middle = 0.5 * (lower + upper)
+            up = rises(middle)
+            lower, upper = dr.select(up, lower, middle), dr.select(up, middle, upper)
+        return 0.5 * (lower + upper)
+
+    def past_minimum(x):
+        # d/dv (2v + R² μ) = 2 + 2 R² (sin v − v cos v)/sin³ v, times |sin³ v|, with v = mπ + x
+        s, c = dr.sincos(x)
+        return s**3 + R2 * (s - (low + x) * c) > 0
+
+    x_min = bisect(mi.Float(0), mi.Float(dr.pi), past_minimum)
+
+    def excess(x):
+        s, c = dr.sincos(x)
+        return (2 * (low + x) - zeta) * dr.square(s) + R2 * (low + x - s * c)
+
+    exists = excess(x_min) < 0
+    x = bisect(dr.select(second, x_min, 0), dr.select(second, dr.pi, x_min),
+               lambda x: dr.select(second, excess(x) > 0, excess(x) < 0))
+    v = low + x
+    horizontal = dr.sqrt(r2) * v / dr.sin(x)
+    vertical = 2 * v / k
+    distance = dr.hypot(horizontal, vertical)
+    a, w = horizontal / distance, vertical / distance
+    # Displacement and direction differ by the half turn; an odd m turns round by π in addition.
+    up = dr.select(height < 0, -1, mi.Float(1)) * dr.sign(twist)
+    odd = (m - 2 * dr.floor(0.5 * m)) > 0.5
+    angle = dr.atan2(dy, dx) + dr.select(odd, dr.pi, 0)
+    turn = v * dr.select(height < 0, -1, mi.Float(1))
+    s0, c0 = dr.sincos(angle - turn)
+    s1, c1 = dr.sincos(angle + turn)
+    w *= up
+    density = geometry.area_density(distance, w, twist)
+    found = exists & (r2 > 0)
+    return (mi.Vector3f(a * c0, a * s0, w), mi.Vector3f(a * c1, a * s1, w),
+            dr.select(found, distance, dr.inf), density)
