@@ -294,13 +294,18 @@ class NilIntegrator(ADIntegrator):
     def _visible(self, view, si, light, cone, active):
         """Whether nothing stands between a surface and the light drawn there."""
         space, tracer = view.space, view.tracer
-        start = offset(si.p, si.n, light.direction, space)
+        direction, distance = light.direction, light.distance
+        start = offset(si.p, si.n, direction, space)
+        if view.lights.has_area:
+            # Aimed anew from the offset start: a light seen at a grazing angle would hide itself.
+            way = geometry.connect(start, light.target, space.twist)
+            aim = ~light.delta & (distance < dr.inf)
+            direction = dr.select(aim, mi.Vector3f(way.direction), direction)
+            distance = dr.select(aim, way.distance, distance)
         if space.quotient:
             start = geometry.wrap(start, space.twist)[0]
-        # Mitsuba's own margin before the light
-        reach = dr.minimum(light.distance * (1 - SHADOW_EPSILON),
-                           tracer.reach(start, light.direction))
-        blocked = tracer.intersect(start, light.direction, cone, reach, active, si.time)
+        reach = dr.minimum(distance * (1 - SHADOW_EPSILON), tracer.reach(start, direction))
+        blocked = tracer.intersect(start, direction, cone, reach, active, si.time)
         return ~blocked.valid
 
     @dr.syntax

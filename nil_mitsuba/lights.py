@@ -31,16 +31,18 @@ class LightSample:
     """Light that may arrive at a vertex.
 
     ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
-    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with
+    it, infinite for directional light; ``target`` (cells): the point on an area light; ``weight``: radiance over probability; ``pdf``: with
     respect to solid angle, 0 for ``delta`` light, which no other technique finds.
     """
 
-    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum,
-                    "pdf": mi.Float, "delta": mi.Bool}
+    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "target": mi.Point3f,
+                    "weight": mi.Spectrum, "pdf": mi.Float, "delta": mi.Bool}
 
-    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None):
+    def __init__(self, direction=None, distance=None, target=None, weight=None, pdf=None,
+                 delta=None):
         self.direction = direction
         self.distance = distance
+        self.target = target
         self.weight = weight
         self.pdf = pdf
         self.delta = delta
@@ -203,8 +205,7 @@ class Lights:
         def among(flag):
             return active if kinds == 1 else active & mi.has_flag(flags, flag)
 
-        sample = LightSample(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Spectrum(0), mi.Float(0),
-                             mi.Bool(False))
+        sample = dr.zeros(LightSample)
         if self.has_infinite:
             lit = among(mi.EmitterFlags.Infinite)
             found = self._sample_infinite(emitter, si, u, lit)
@@ -224,7 +225,8 @@ class Lights:
 
     def _sample_infinite(self, emitter, si, u, active):
         ds, weight = emitter.sample_direction(si, u, active)
-        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), weight & (ds.pdf > 0),
+        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), mi.Point3f(0),
+                           dr.select(ds.pdf > 0, weight, 0),
                            dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta))
 
     def _image_of(self, p, q, u1, u2):
@@ -260,7 +262,7 @@ class Lights:
         pdf = probability * density / (area * stretch * cosine)
         reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
         pdf = dr.select(reached, pdf, 0)
-        return LightSample(direction, way.distance,
+        return LightSample(direction, way.distance, image,
                            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False))
 
     def _sample_point(self, emitter, q, si, p, u, u1, u2, active):
@@ -296,7 +298,7 @@ class Lights:
         density = dr.abs(density) * dr.square(space.size)
         reached = active & (density > 0) & (distance <= self.max_distance) & (ds.pdf > 0)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True))
+        return LightSample(direction, distance, image, weight, mi.Float(0), mi.Bool(True))
 
     # ------------------------------------------------------------------ weights
 
@@ -336,7 +338,7 @@ class Lights:
             # Per solid angle at unit distance, face to face: per unit of area
             varying = lit
             if self.has_plain_area:
-                varying &= mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+                varying = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
             ds = dr.zeros(mi.DirectionSample3f)
             ds.uv, ds.dist, ds.n, ds.d = si.uv, 1, mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, -1)
             textured = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, varying)
