@@ -186,7 +186,7 @@ class NilIntegrator(ADIntegrator):
         # --------------------- Configure loop state ----------------------
 
         p, v = mi.Point3f(p), mi.Vector3f(v)   # Start of the current segment, cells and frame
-        cone = Cone(cone.width, cone.spread)   # How far off the segment may be
+        cone = Cone(cone.width, cone.spread, cone.soft)   # How far off the segment may be
         depth = mi.UInt32(0)                   # Depth of current vertex
         L = mi.Spectrum(0)                     # Radiance accumulator
         β = mi.Spectrum(1)                     # Path throughput weight
@@ -273,6 +273,7 @@ class NilIntegrator(ADIntegrator):
             # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
             lobe = dr.minimum(dr.rsqrt(dr.pi * dr.maximum(bsdf_sample.pdf, 1e-8)), 1)
             cone.width = width
+            cone.soft |= active_next & ~bsdf_delta_prev & (lobe > 0.1)
             cone.spread = dr.select(
                 bsdf_delta_prev, cone.spread, dr.maximum(cone.spread, view.rough_spread * lobe)
             )
@@ -305,8 +306,7 @@ class NilIntegrator(ADIntegrator):
         if space.quotient:
             start = geometry.wrap(start, space.twist)[0]
         reach = dr.minimum(distance * (1 - SHADOW_EPSILON), tracer.reach(start, direction))
-        blocked = tracer.intersect(start, direction, cone, reach, active, si.time)
-        return ~blocked.valid
+        return ~tracer.occluded(start, direction, cone, reach, active, si.time)
 
     @dr.syntax
     def _beyond_lights(self, view, time, p, v, cone, active):

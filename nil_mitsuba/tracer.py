@@ -22,13 +22,18 @@ from .quotient import Space, exit_through_face, opaque, through_face
 SAGITTA = 0.25
 
 class Cone:
-    """How far off a ray may be: ``width`` + ``spread`` · distance (cells), as a pixel's cone."""
+    """How far off a ray may be: ``width`` + ``spread`` · distance (cells), as a pixel's cone.
 
-    DRJIT_STRUCT = {"width": mi.Float, "spread": mi.Float}
+    Behind a rough bounce a ray is ``soft``: nobody sees where it went, so its hits need not lie
+    on the geodesic; they lie on the polygon of chords, whose error has mean zero.
+    """
 
-    def __init__(self, width=0.0, spread=0.0):
+    DRJIT_STRUCT = {"width": mi.Float, "spread": mi.Float, "soft": mi.Bool}
+
+    def __init__(self, width=0.0, spread=0.0, soft=False):
         self.width = mi.Float(width)
         self.spread = mi.Float(spread)
+        self.soft = mi.Bool(soft)
 
 
 class Hit:
@@ -247,7 +252,7 @@ class Tracer:
             error = bend * dr.select(refining, 0.5 * dr.square(s), 0.125 * dr.square(scale))
             error = dr.select(sideways & ~refining, dr.inf, error)
             goal = dr.fma(0.004, dr.fma(cone.spread, t_hit, cone.width), 4e-6)
-            accept = pi.valid & (error <= goal)
+            accept = pi.valid & (cone.soft | (error <= goal))
             redo = refining & ~pi.valid
             look = pi.valid & ~accept
             window = dr.select(
@@ -281,3 +286,67 @@ class Tracer:
 
         return Hit(valid, distance, turned(v, k * v.z * distance), cell,
                    ray_found, found)
+
+    @dr.syntax
+    def occluded(self, p: mi.Point3f, v: mi.Vector3f, cone: Cone, reach: mi.Float,
+                 active: mi.Bool, time: mi.Float = 0) -> mi.Bool:
+        """Whether anything stands in the way of the geodesic from ``p`` within ``reach`` (cells).
+
+        As `intersect` with a ``soft`` cone, but any surface will do.
+        """
+        space, scene = self.space, self.scene
+        k = space.twist
+        quotient = space.quotient
+        vertex, end, base = mi.Point3f(p), mi.Point3f(p), mi.Point3f(p)
+        t0, t1 = mi.Float(0), mi.Float(0)
+        cell = mi.Vector3i(0)
+        blocked = mi.Bool(False)
+        active = active & (reach > 0)
+        stretch = dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3)
+
+        while active:
+            v1 = turned(v, k * v.z * t1)
+            fresh = t0 >= t1
+            h = stretch * self.chord_length(v1, t0, cone)
+            wanted = mi.Float(h)
+            empty = mi.Bool(False)
+            if not quotient:
+                skip = self.outside(vertex, v1)
+                empty = fresh & (skip > h)
+                h = dr.maximum(h, skip)
+            last = h >= reach - t0
+            h = dr.select(fresh, dr.minimum(h, reach - t0), 0)
+            point, tangent = geometry.flow(base, v1, h, k)
+            base = mi.Point3f(point)
+            t1 += h
+            lift = -(2 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h))
+            lift = dr.select(last, 0, lift)
+            corner = dr.fma(lift, self.acceleration(point, tangent), point)
+            end = dr.select(fresh, corner, end)
+
+            along = mi.Vector3f(end - vertex)
+            s_last = mi.Float(1)
+            leaves = mi.Bool(False)
+            face = mi.Vector3i(0)
+            if quotient:
+                s_last, face = exit_through_face(vertex, along)
+                leaves = s_last < 1
+                s_last = dr.minimum(s_last, 1)
+            speed = dr.norm(along)
+            d = dr.select(speed > 0, along / speed, v1)
+            before = dr.select(t0 > 0, space.slack, 0)
+            o = space.to_scene(vertex - before * d)
+            after = dr.select(leaves | ~last, space.slack, 0)
+            ray = dr.zeros(mi.Ray3f)
+            ray.o, ray.d, ray.time = o, d, time
+            ray.maxt = (s_last * speed + before + after) * space.size
+            hit = scene.ray_test(ray, coherent=False, active=active & ~empty)
+
+            blocked |= hit
+            t0 = dr.select(leaves, dr.fma(s_last, t1 - t0, t0), t1)
+            vertex = dr.select(leaves, dr.fma(along, s_last, vertex), end)
+            if quotient:
+                face = dr.select(leaves, face, 0)
+                vertex, (end, base), cell = through_face(vertex, [end, base], cell, face, space)
+            active &= ~hit & (t0 < reach)
+        return blocked

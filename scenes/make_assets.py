@@ -5,7 +5,6 @@ Run it from anywhere, after `pip install .`, to make them anew: ``python scenes/
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.Jit will use
@@ -59,10 +58,11 @@ def stripes(name, size=128):
 def torus_knot(name, p=2, q=3, around=30, along=900):
     """Write a tube around the (p, q) torus knot: 2 · around · along triangles in [−1, 1]³.
 
-    The tube's thickness swells p q times; vertices carry the colours of the rainbow in the order
-    of the curve, and no normals: Mitsuba computes smooth ones.
+    Vertices carry the colours of the rainbow in the order of the curve, and no normals: Mitsuba
+    computes smooth ones.
     """
-    ring, section = 0.55, 0.26  # radii of the torus: with the tube it stays inside the unit ball
+    # Radii of the torus that carries the curve, and of the tube: they add up to less than 1.
+    ring, section, tube = 0.57, 0.27, 0.1
     i, j = dr.meshgrid(dr.arange(mi.Float, around), dr.arange(mi.Float, along))
     t, s = dr.two_pi / along * j, dr.two_pi / around * i
 
@@ -75,8 +75,7 @@ def torus_knot(name, p=2, q=3, around=30, along=900):
     outwards = curve(t) - ring * mi.Vector3f(dr.cos(p * t), dr.sin(p * t), 0)
     normal = dr.normalize(outwards - tangent * dr.dot(tangent, outwards))
     binormal = dr.cross(tangent, normal)
-    radius = 0.105 + 0.02 * dr.cos(p * q * t)
-    position = curve(t) + radius * (normal * dr.cos(s) + binormal * dr.sin(s))
+    position = curve(t) + tube * (normal * dr.cos(s) + binormal * dr.sin(s))
     hue = t + mi.Vector3f(0, 1, 2) * (dr.two_pi / 3)
     color = dr.square(0.5 + 0.42 * dr.cos(hue))
 
@@ -114,5 +113,5 @@ if __name__ == "__main__":
     sky(
         "night.exr",
         zenith=(0.02, 0.06, 0.16), horizon=(0.10, 0.34, 0.42), nadir=(0.03, 0.02, 0.08),
-        glows=[((5.0, 5.6, 6.4), (-0.75, -0.45, 0.35), 12), ((1.6, 0.7, 0.3), (0.9, -0.3, -0.3), 5)],
+        glows=[((5, 5.6, 6.4), (-0.75, -0.45, 0.35), 12), ((1.6, 0.7, 0.3), (0.9, -0.3, -0.3), 5)],
     )  # fmt: skip

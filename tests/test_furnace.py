@@ -7,7 +7,7 @@ sample must give the exact value but for float32 rounding.
 import drjit as dr
 import mitsuba as mi
 import pytest
-from studio import film, without_emitter_sampling
+from studio import film, without_emitter_sampling, write_ply
 
 ALBEDO, EMISSION = 0.8, 0.5
 
@@ -56,35 +56,80 @@ def furnished_room():
     T = mi.ScalarTransform4f
     return cube_room() | {
         "ball": glowing({"type": "sphere", "center": [-0.5, 0.4, -0.6], "radius": 0.3}),
-        "pole": glowing({"type": "cylinder", "p0": [0.5, 0.5, -1], "p1": [0.5, 0.5, 1],
-                         "radius": 0.1}),
-        # Inside the pole nobody looks: the cylinder is open, but both ends touch the room.
         "box": glowing({"type": "cube",
                         "to_world": T().translate([0, -0.6, -0.7]).rotate([0, 0, 1], 20)
                         .scale(0.25)}),
     }
 
 
-def lattice_room():
-    """Walls across the middle of the cell that reach through its faces: what is left open between
-    them is a room that lies around the cell's edges and corner, through all six faces."""
-    T = mi.ScalarTransform4f
-    return {
-        f"wall{i}": glowing({
-            "type": "cube",
-            # Beyond the cube they do not exist.
-            "to_world": T().translate([0.5, 0.5, 0.5])
-            .scale([0.02 if i == j else 0.6 for j in range(3)]),
-        })
-        for i in range(3)
-    }
+class Walls:
+    """One mesh of quadrangles that all glow towards the room.
+
+    Nothing sticks out behind them: a part of a wall that was hidden in another would be found by
+    rays whose error, which a rough bounce allows to grow, takes them round the corner.
+    """
+
+    def __init__(self):
+        self.vertices, self.triangles = [], []
+
+    def add(self, towards, *corners):
+        """A quadrangle whose front is seen from the direction ``towards``."""
+        first = len(self.vertices)
+        self.vertices += corners
+        u, v = ([c - o for c, o in zip(corner, corners[0])] for corner in (corners[1], corners[2]))
+        normal = [u[i - 2] * v[i - 1] - u[i - 1] * v[i - 2] for i in range(3)]
+        front = sum(n * t for n, t in zip(normal, towards)) > 0
+        for i, j in ((1, 2), (2, 3)):
+            self.triangles.append((first, first + i, first + j) if front
+                                  else (first, first + j, first + i))
+
+    def save(self, folder):
+        file = write_ply(folder / "walls.ply", self.vertices, self.triangles)
+        return {"walls": glowing({"type": "ply", "filename": file, "face_normals": True})}
 
 
-def lattice_of_balls_and_floor():
-    """Two glowing walls and a ball: no ray goes further than the walls' distance."""
-    walls = lattice_room()
-    walls["ball"] = glowing({"type": "sphere", "center": [0.98, 0.2, 0.8], "radius": 0.3})
-    return walls
+# The two ends of an axis: what goes beyond the cube does not exist, and leaves no crack at it.
+ENDS = ((-0.1, 0.48, -1), (0.52, 1.1, 1))
+
+
+def room_across_faces(twist, folder):
+    """A room around the cell's faces, edges and corner, between walls in the cell's middle.
+
+    Its floor and ceiling z = 1/2 ± 0.005 + k x y, |y| < 1/2, cross the faces x and y without a
+    step (a plane z = const does not: the gluing shears it).
+    """
+    walls = Walls()
+    for x0, x1, right in ENDS:
+        for y0, y1, back in ENDS:
+            far = back > 0
+            for side in (1, -1):
+                end = 1.1 if side > 0 else -0.1
+
+                def at(x, y):
+                    return x, y, 0.5 + side * 0.005 + twist * x * (y - far)
+
+                x, y = x0 if right > 0 else x1, y0 if back > 0 else y1
+                walls.add((right, 0, 0), at(x, y0), at(x, y1), (x, y1, end), (x, y0, end))
+                walls.add((0, back, 0), at(x0, y), at(x1, y), (x1, y, end), (x0, y, end))
+                # It bends between its corners, so they lie on the faces of the cube.
+                u0, u1 = max(x0, 0.0), min(x1, 1.0)
+                v0, v1 = max(y0, 0.0), min(y1, 1.0)
+                walls.add((0, 0, side), at(u0, v0), at(u1, v0), at(u1, v1), at(u0, v1))
+    return walls.save(folder)
+
+
+def room_across_y_and_z(_twist, folder):
+    """A room around the faces y and z, with walls before the faces x."""
+    walls = Walls()
+    for y0, y1, back in ENDS:
+        for z0, z1, up in ENDS:
+            y, z = y0 if back > 0 else y1, z0 if up > 0 else z1
+            for x, right in ((0.02, 1), (0.98, -1)):
+                walls.add((right, 0, 0), (x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1))
+            walls.add((0, back, 0), (0.02, y, z0), (0.98, y, z0), (0.98, y, z1), (0.02, y, z1))
+            walls.add((0, 0, up), (0.02, y0, z), (0.98, y0, z), (0.98, y1, z), (0.02, y1, z))
+    ball = glowing({"type": "sphere", "center": [0.4, 0.2, 0.8], "radius": 0.15})
+    return {"ball": ball, **walls.save(folder)}
 
 
 def check_room(scene, integrator, max_depth, spp, seed=0):
@@ -121,22 +166,45 @@ def test_closed_room_does_not_depend_on_the_cell(rgb, cell):
                spp=16)
 
 
-@pytest.mark.parametrize("room", [lattice_room, lattice_of_balls_and_floor])
-@pytest.mark.parametrize("twist", [0, 1, 2, -1])
-def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(rgb, room, twist):
-    """Its rays cross all faces, edges and corners of the cell. A lost or doubled vertex makes its
-    pixel differ by 1e-4 or more."""
+@pytest.mark.parametrize("room, twist", [
+    *[(room_across_faces, twist) for twist in (0, 1, -1)],
+    *[(room_across_y_and_z, twist) for twist in (0, 1, 2)],
+])
+def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(rgb, room, twist,
+                                                                           tmp_path):
+    """A lost or doubled vertex makes its pixel differ by 1e-4 or more."""
     scene = mi.load_dict({"type": "scene", "sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95]),
-                          **room()})
+                          **room(twist, tmp_path)})
     check_room(scene, nil(twist, True, 8), 8, spp=16)
+
+
+@pytest.mark.parametrize("twist", [0, 1, 2, 3])
+def test_glowing_things_under_an_equally_bright_sky_are_invisible(rgb, twist):
+    """In equilibrium each path has the same radiance, wherever it ends and whatever it crosses."""
+    things = {
+        "a": glowing({"type": "sphere", "center": [0.3, 0.6, 0.4], "radius": 0.25}),
+        "b": glowing({"type": "cube", "to_world": mi.ScalarTransform4f()
+                      .translate([0.5, 0.15, 0.8]).rotate([0, 0, 1], 30).scale(0.1)}),
+    }
+    equilibrium = EMISSION / (1 - ALBEDO)
+    scene = mi.load_dict({
+        "type": "scene", "sensor": sensor([0.05, 0.05, 0.05], [0.6, 0.5, 0.4]), **things,
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": equilibrium}},
+    })
+    # 0.8^120 is below a unit in the last place
+    image = mi.render(scene, integrator=nil(twist, True, 120), spp=16)
+    error = dr.max(dr.abs(image.array / equilibrium - 1))[0]
+    assert error <= 3 * ROUNDING
 
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist, quotient", [(1, False), (3, False), (1, True), (2, True)])
-def test_no_ray_is_lost_at_ten_million_vertices(rgb, twist, quotient):
+def test_no_ray_is_lost_at_ten_million_vertices(rgb, twist, quotient, tmp_path):
     """A vertex lost in any of 10⁷ leaves its pixel 1e-4 or more too dark."""
     if quotient:
-        scene = {"sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95], 256), **lattice_room()}
+        room = room_across_faces if twist == 1 else room_across_y_and_z
+        scene = {"sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95], 256),
+                 **room(twist, tmp_path)}
     else:
         scene = {"sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0], 256), **furnished_room()}
     scene = mi.load_dict({"type": "scene", **scene})
@@ -185,8 +253,9 @@ def test_white_things_vanish_under_a_white_sky(rgb, bsdf, twist, quotient):
     image = mi.render(scene, integrator=nil(twist, quotient, max_depth), spp=1)
     ended = image.array == 0
     assert dr.all(ended | (dr.abs(image.array / 0.7 - 1) <= ROUNDING))
-    # In the quotient a path is free after 12 cells without a hit: one bounce in two.
-    assert dr.count(ended)[0] <= (0.01 if quotient else 0.001) * len(image.array)
+    # In the quotient a path is free only after 12 cells without a hit, and one that goes straight
+    # through things may meet them again for ever.
+    assert dr.count(ended)[0] <= (0.3 if quotient else 0.001) * len(image.array)
 
 
 def test_sky_behind_the_horizon_is_seen_undimmed(rgb):
