@@ -35,8 +35,8 @@ def uv(vertex):
 
 
 def write_obj(path):
-    lines = ["v %f %f %f" % v for v in ICOSAHEDRON]
-    lines += ["vt %f %f" % uv(v) for v in ICOSAHEDRON]
+    lines = [f"v {x:f} {y:f} {z:f}" for x, y, z in ICOSAHEDRON]
+    lines += ["vt {:f} {:f}".format(*uv(v)) for v in ICOSAHEDRON]
     lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in f) for f in faces(ICOSAHEDRON)]
     path.write_text("\n".join(lines) + "\n")
     return str(path)
@@ -44,15 +44,18 @@ def write_obj(path):
 
 def write_ply(path, vertices=ICOSAHEDRON, triangles=None):
     """A mesh with a colour at each vertex (attribute vertex_color) and each face (face_color)."""
+    def colour(i):
+        return [0.5 + 0.4 * math.sin(7 * i + j) for j in range(3)]
+
     triangles = triangles or faces(vertices)
     header = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
     header += [f"property float {name}" for name in "xyzrgb"]
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     header += [f"property float {name}" for name in "rgb"]
-    lines = ["%.9g %.9g %.9g %f %f %f" % (*v, *(0.5 + 0.4 * math.sin(7 * i + j) for j in range(3)))
+    lines = [" ".join(f"{c:.9g}" for c in (*v, *colour(i)))
              for i, v in enumerate(vertices)]
-    lines += ["3 %d %d %d %f 0.3 0.5" % (*f, (i + 1) / (len(triangles) + 1))
-              for i, f in enumerate(triangles)]
+    lines += [f"3 {a} {b} {c} {(i + 1) / (len(triangles) + 1):f} 0.3 0.5"
+              for i, (a, b, c) in enumerate(triangles)]
     path.write_text("\n".join([*header, "end_header", *lines]) + "\n")
     return str(path)
 
@@ -71,7 +74,7 @@ def write_serialized(path):
 
 def write_curve(path):
     points = [(math.sin(i), math.cos(i), 0.4 * i - 1.4, 0.15 + 0.02 * i) for i in range(8)]
-    path.write_text("\n".join("%f %f %f %f" % p for p in points) + "\n")
+    path.write_text("\n".join(" ".join(f"{c:f}" for c in p) for p in points) + "\n")
     return str(path)
 
 
@@ -101,6 +104,6 @@ def film(width, height, **more):
 
 
 def without_emitter_sampling(integrator):
-    """The integrator, told to find lights by BSDF sampling alone (fewer samples, less to go wrong)."""
+    """The integrator, told to find lights by BSDF sampling alone."""
     integrator.emitter_sampling = False
     return integrator

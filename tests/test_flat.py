@@ -10,6 +10,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
+
 from studio import (
     film,
     gradient,
@@ -226,10 +227,11 @@ def test_flat_texture_of_emission_has_the_expectation_of_path(rgb):
     def light(scale=2.0):
         return {"type": "area", "radiance": texture(scale)}
 
+    tilt = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 40)
     lights = [
         lambda to_world: [{"type": "rectangle", "to_world": to_world, "light": light()}],
         lambda to_world: [{"type": "rectangle", "light": light(4.0), "bsdf": {"type": "plastic"},
-                           "to_world": to_world @ mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 40)}],
+                           "to_world": to_world @ tilt}],
         lambda to_world: [{"type": "disk", "to_world": to_world, "light": light()}],
         lambda to_world: [{"type": "sphere", "to_world": to_world,
                            "light": {"type": "area", "radiance": {"type": "rgb", "value": 2}}}],

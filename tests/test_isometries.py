@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 from drjit.llvm import Array3f64
-from studio import ICOSAHEDRON, faces, film, write_ply
-from ztest import Estimate, assert_same_expectation, z_scores
 
 from nil_mitsuba import geometry
+from studio import ICOSAHEDRON, faces, film, write_ply
+from ztest import Estimate, assert_same_expectation, z_scores
 
 
 def multiply(h, p, twist):

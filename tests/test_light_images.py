@@ -250,7 +250,7 @@ def test_rendered_patch_shows_the_irradiance_of_a_point_light(rgb, twist):
 # ------------------------------------------------------------------ hard places
 
 
-def render_without_fireflies(twist, quotient, max_depth=4, spp=16, **lights):
+def render_without_fireflies(twist, quotient, max_depth=3, spp=4, **lights):
     scene = room(**lights)
     integrator = mi.load_dict({"type": "nil", "twist": float(twist), "quotient": quotient,
                                "max_depth": max_depth})
@@ -378,5 +378,5 @@ def test_area_light_outside_the_cube_is_dark_and_a_point_light_there_is_carried_
               for p in lamps]
     # Rounding moves the lamp by 1e-7, which now and then decides about a shadow.
     differ = dr.count(dr.abs(images[0].array - images[1].array) > 1e-3 * images[0].array + 1e-4)
-    assert differ[0] <= 0.01 * len(images[0].array)
+    assert differ[0] <= 0.02 * len(images[0].array)
     assert dr.mean(images[0].array)[0] > 0

@@ -1,13 +1,13 @@
-"""Surfaces in Nil's orthonormal frame: normals, tangents, shading frames, and the next ray's start."""
+"""Surfaces in Nil's orthonormal frame: normals, shading frames, and the next ray's start."""
 
 import math
 
 import drjit as dr
 import mitsuba as mi
 import pytest
-from studio import film, place, texture, write_ply
 
 from nil_mitsuba import geometry
+from studio import film, place, texture, write_ply
 
 
 def scene_of(thing):
@@ -82,6 +82,16 @@ def test_normal_is_orthogonal_to_what_the_frame_makes_of_tangents(rgb, kind, twi
     # It stays on the same side of the surface.
     outward = mi.Vector3f(geometry.to_frame(p, straight.n, twist))
     assert dr.all(~hit.valid | (dr.dot(si.n, outward) > 0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shading_normal_of_a_surface_without_interpolation_is_its_normal(rgb, kind, tmp_path):
+    hit, si, straight, _, _ = hits(surfaces(tmp_path)[kind], 2.0)
+    same = hit.valid & (dr.dot(straight.sh_frame.n, straight.n) > 1 - 1e-6)
+    assert dr.any(same) or kind == "ply"
+    assert dr.all(~same | (dr.norm(si.sh_frame.n - si.n) < 3e-3))
+    # Where vertex normals are interpolated it is another one, on the same side.
+    assert dr.all(~hit.valid | (dr.dot(si.sh_frame.n, si.n) > 0.3))
 
 
 @pytest.mark.parametrize("twist", [1.0, 3.0])

@@ -18,10 +18,10 @@ POOLED_Z = 3.5
 
 
 class Estimate:
-    """Mean XYZ of each pixel and the variance of that mean, by channel; ``shape`` is (rows, columns).
+    """Mean XYZ of each pixel, and the variance of that mean; ``shape`` is (rows, columns).
 
     A variance is not believed below what float32 sums of squares resolve (1e-5 of the square of
-    the mean, per sample), nor are pixels that one sample in a hundred thousand reaches.
+    the mean, per sample).
     """
 
     def __init__(self, scene, integrator, spp, seed=0, sensor=0):
