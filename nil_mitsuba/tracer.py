@@ -145,11 +145,12 @@ class Tracer:
         square = dr.fma(spread, spread, 2 * g * SAGITTA * dr.fma(cone.spread, t, cone.width))
         h = 2 * (spread + dr.sqrt(square)) / g
         if remaining is not None:
-            square = dr.fma(spread, spread,
-                            2 * g * SAGITTA * dr.fma(cone.spread, remaining, cone.width))
-            h = dr.minimum(h, 2 * (dr.sqrt(square) - spread) / g)
-        # Along more than 1/k the chord is no parabola any more.
-        return dr.minimum(h, dr.rcp(dr.maximum(k, 1e-9)))
+            room = SAGITTA * dr.fma(cone.spread, remaining, cone.width)
+            root = dr.sqrt(dr.fma(spread, spread, 2 * g * room))
+            h = dr.minimum(h, 4 * room / dr.maximum(root + spread, 1e-20))
+        # Along more than 1/k the chord is no parabola any more; below 1e-4 cells its sagitta is
+        # lost in float32's rounding.
+        return dr.clip(h, 1e-4, dr.rcp(dr.maximum(k, 1e-9)))
 
     # ------------------------------------------------------------------ tracing
 

@@ -105,7 +105,7 @@ def test_sampling_round_and_mesh_lights_keeps_the_mean(rgb, twist, quotient, tmp
     compare_with_and_without(room(**bulb(), **gem(tmp_path)), twist, quotient, spp=512)
 
 
-@pytest.mark.parametrize("twist, quotient", SPACES)
+@pytest.mark.parametrize("twist, quotient", [(1, False), (1, True)])
 def test_sampling_the_sky_among_lights_keeps_the_mean(rgb, twist, quotient):
     """Fails on equal expectations for one seed in 700."""
     compare_with_and_without(room(**bulb(), **sky()), twist, quotient, spp=256)
@@ -272,14 +272,16 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("twist, quotient", [(1, False), (3, False), (0, True), (1, True),
-                                             (3, True)])
+@pytest.mark.parametrize("twist, quotient", [
+    (1, True), *(pytest.param(k, q, marks=pytest.mark.verify) for k, q in
+                 ((1, False), (3, False), (0, True), (3, True)))])
 def test_point_light_in_a_hard_place_leaves_a_finite_image(rgb, twist, quotient):
     for position in HARD.values():
         render_without_fireflies(twist, quotient, lamp={"type": "point", "position": position})
 
 
-@pytest.mark.parametrize("twist", [0, 1, 3])
+@pytest.mark.parametrize("twist", [
+    1, *(pytest.param(k, marks=pytest.mark.verify) for k in (0, 3))])
 def test_area_light_that_touches_surfaces_leaves_a_finite_image(rgb, twist):
     """In the floor's own plane, through a ball, across the cell's faces."""
     T = mi.ScalarTransform4f()

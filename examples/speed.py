@@ -1,0 +1,143 @@
+"""Prints what curvature costs: time against ``path``, compile time, triangles, memory.
+
+Times are ratios from one run, processor time of all threads, because machines are noisy.
+"""
+
+import argparse
+import math
+import resource
+import time
+
+import nil_mitsuba  # noqa: F401, I001 - before mitsuba: it chooses LLVM
+
+import drjit as dr
+import mitsuba as mi
+
+mi.set_variant("llvm_ad_rgb")
+
+
+def bent_box(width, **properties):
+    """Mitsuba's Cornell box with ``nil`` as the issue of its cost is usually put: one cell."""
+    scene = mi.cornell_box()
+    scene["sensor"]["film"]["width"] = scene["sensor"]["film"]["height"] = width
+    scene["integrator"] = {
+        "type": "nil", "max_depth": 6, "quotient": False, "cell_size": 2.0,
+        "cell_origin": mi.ScalarPoint3f(-1, -1, -1),
+    } | properties  # fmt: skip
+    return mi.load_dict(scene)
+
+
+def seconds(scene, spp, seed):
+    """Processor seconds of one warm render and the image's mean."""
+    start = time.process_time()
+    image = mi.render(scene, spp=spp, seed=seed)
+    dr.eval(image)
+    dr.sync_thread()
+    return time.process_time() - start, float(dr.mean(image.array)[0])
+
+
+def against_path(width, spp, rounds):
+    straight = bent_box(width)
+    del straight
+    scene = mi.cornell_box()
+    scene["sensor"]["film"]["width"] = scene["sensor"]["film"]["height"] = width
+    scene["integrator"] = {"type": "path", "max_depth": 6}
+    contestants = {
+        "path": mi.load_dict(scene),
+        "nil, twist 0": bent_box(width, twist=0.0),
+        "nil, twist 1": bent_box(width),
+        "nil, twist 1, tolerance / 16": bent_box(width, tolerance=0.25 / 16),
+    }
+    start = time.perf_counter()
+    mi.render(contestants["nil, twist 1"], spp=1)
+    dr.sync_thread()
+    print(f"first render, compilation included: {time.perf_counter() - start:.1f} s")
+    for scene in contestants.values():
+        seconds(scene, spp, 0)
+    times = {name: [] for name in contestants}
+    means = {name: [] for name in contestants}
+    for seed in range(1, rounds + 1):
+        for name, scene in contestants.items():
+            t, mean = seconds(scene, spp, seed)
+            times[name].append(t)
+            means[name].append(mean)
+    print(f"\ncornell box, {width}x{width}, {spp} spp, max_depth 6, {rounds} rounds")
+    for name in contestants:
+        ratios = sorted(t / p for t, p in zip(times[name], times["path"]))
+        mean = sum(means[name]) / rounds
+        error = math.sqrt(sum((m - mean) ** 2 for m in means[name]) / max(1, rounds - 1) / rounds)
+        print(f"{name:30} {ratios[len(ratios) // 2]:6.2f} times path   "
+              f"mean {mean:.5f} ± {error:.5f}")
+
+
+def against_triangles(sizes):
+    print("\ntriangles   time per path (relative to the first)")
+    first = None
+    for triangles in sizes:
+        n = round(math.sqrt(triangles / 2))
+        scene = {
+            "type": "scene",
+            "integrator": {"type": "nil", "max_depth": 4},
+            "sensor": {
+                "type": "perspective", "fov": 70,
+                "to_world": mi.ScalarTransform4f().look_at([0.5, 0.05, 0.6], [0.5, 1, 0.4],
+                                                           [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 128, "height": 128},
+            },
+            "sky": {"type": "constant"},
+            "mesh": bumpy_sphere(n),
+        }  # fmt: skip
+        scene = mi.load_dict(scene)
+        seconds(scene, 32, 0)
+        t = min(seconds(scene, 32, seed)[0] for seed in (1, 2, 3))
+        first = first or t
+        print(f"{2 * n * n:9,}   {t / first:.2f}", flush=True)
+
+
+def bumpy_sphere(n):
+    """A sphere with waves, of 2 n² triangles, in the middle of the unit cube."""
+    index = dr.arange(mi.UInt32, (n + 1) * (n + 1))
+    u, v = mi.Float(index % (n + 1)) / n, mi.Float(index // (n + 1)) / n
+    radius = 0.3 + 0.02 * dr.sin(40 * dr.pi * u) * dr.sin(20 * dr.pi * v)
+    theta, phi = dr.pi * v, 2 * dr.pi * u
+    p = mi.Point3f(dr.sin(theta) * dr.cos(phi), dr.sin(theta) * dr.sin(phi), dr.cos(theta))
+    face = dr.arange(mi.UInt32, n * n)
+    corner = face + face // n
+    a = mi.Vector3u(corner, corner + n + 1, corner + 1)
+    b = mi.Vector3u(corner + 1, corner + n + 1, corner + n + 2)
+    mesh = mi.Mesh("bumps", (n + 1) * (n + 1), 2 * n * n, props=mi.Properties())
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = dr.ravel(p * radius + 0.5)
+    faces = dr.zeros(mi.UInt32, 6 * n * n)
+    for i, triangle in enumerate((a, b)):
+        for j in range(3):
+            dr.scatter(faces, triangle[j], (2 * face + i) * 3 + j)
+    parameters["faces"] = faces
+    parameters.update()
+    return mesh
+
+
+def memory():
+    """Peak memory that a pass of a million camera samples adds."""
+    scene = bent_box(1024)
+    mi.render(bent_box(64), spp=1)
+    dr.sync_thread()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds(scene, 1, 0)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(f"\npeak memory per million camera samples: {(after - before) / 1024 / 1.048576:.0f} MiB "
+          f"(process: {after / 1024:.0f} MiB)")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        memory()
+        against_path(32, 16, 2)
+        against_triangles((1_000, 10_000))
+    else:
+        memory()
+        against_path(128, 256, 5)
+        against_triangles((1_000, 10_000, 100_000, 1_000_000))
