@@ -32,7 +32,7 @@ def film(size):
 
 
 def small_light():
-    """Three balls on a floor, lit by a lamp 6 hundredths of the cell wide, in the quotient."""
+    """Three balls on a floor, lit by a lamp a fiftieth of the cell wide, in the quotient."""
     T = mi.ScalarTransform4f()
 
     def ball(x, y, z, radius, **bsdf):
@@ -47,8 +47,8 @@ def small_light():
         "a": ball(0.6, 0.6, 0.24, 0.2, type="diffuse"),
         "b": ball(0.25, 0.6, 0.18, 0.12, type="roughplastic", alpha=0.2),
         "c": ball(0.35, 0.35, 0.1, 0.06, type="roughconductor", alpha=0.3),
-        "lamp": {"type": "sphere", "center": [0.4, 0.45, 0.75], "radius": 0.03,
-                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [60, 55, 50]}}},
+        "lamp": {"type": "sphere", "center": [0.4, 0.45, 0.75], "radius": 0.01,
+                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [540, 500, 450]}}},
     }), {"twist": 1.0, "quotient": True, "max_depth": 6}
 
 

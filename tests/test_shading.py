@@ -84,14 +84,10 @@ def test_normal_is_orthogonal_to_what_the_frame_makes_of_tangents(rgb, kind, twi
     assert dr.all(~hit.valid | (dr.dot(si.n, outward) > 0))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "rectangle"])
 def test_shading_normal_of_a_surface_without_interpolation_is_its_normal(rgb, kind, tmp_path):
-    hit, si, straight, _, _ = hits(surfaces(tmp_path)[kind], 2.0)
-    same = hit.valid & (dr.dot(straight.sh_frame.n, straight.n) > 1 - 1e-6)
-    assert dr.any(same) or kind == "ply"
-    assert dr.all(~same | (dr.norm(si.sh_frame.n - si.n) < 3e-3))
-    # Where vertex normals are interpolated it is another one, on the same side.
-    assert dr.all(~hit.valid | (dr.dot(si.sh_frame.n, si.n) > 0.3))
+    hit, si, _, _, _ = hits(surfaces(tmp_path)[kind], 2.0)
+    assert dr.all(~hit.valid | (dr.norm(si.sh_frame.n - si.n) < 1e-5))
 
 
 @pytest.mark.parametrize("twist", [1.0, 3.0])
