@@ -57,10 +57,10 @@ class Camera:
         else:
             transform = sensor.world_transform()
             self.origins = [opaque(mi.Point3f(transform @ mi.ScalarPoint3f(0)))]
-            self.axis = opaque(dr.normalize(mi.Vector3f(transform @ mi.ScalarVector3f(0, 0, 1))))
+            self.axis = opaque(dr.normalize(mi.Vector3f(transform @ mi.Vector3f(0, 0, 1))))
         if self.thinlens:
-            self.focus_distance = dr.opaque(mi.Float, parameters["focus_distance"])
-            self.near_clip = dr.opaque(mi.Float, parameters["near_clip"])
+            self.focus_distance = opaque(mi.Float(parameters["focus_distance"]))
+            self.near_clip = opaque(mi.Float(parameters["near_clip"]))
 
     def start(self, ray: mi.RayDifferential3f, position: mi.Vector2f
               ) -> tuple[mi.Point3f, mi.Vector3f, Cone]:

@@ -195,7 +195,8 @@ class NilIntegrator(ADIntegrator):
         β = mi.Spectrum(1)                     # Path throughput weight
         η = mi.Float(1)                        # Index of refraction
         active = mi.Bool(active) & (depth_limit > 0)
-        valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        valid = mi.Bool(not self.hide_emitters and depth_limit > 0
+                        and scene.environment() is not None)
 
         # Variables caching information from the previous bounce
         vertex_prev     = mi.Point3f(p)        # Its position (cells)
@@ -212,7 +213,7 @@ class NilIntegrator(ADIntegrator):
             home = mi.Vector3i(0)
             if space.quotient:
                 p, home = geometry.wrap(p, space.twist)
-            hit = tracer.intersect(p, v, cone, tracer.reach(p, v) - spent, active, ray.time)
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, spent), active, ray.time)
             si = surface_interaction(hit, v, space, ray.wavelengths)
 
             # --------------------- Direct emission ---------------------
@@ -245,7 +246,8 @@ class NilIntegrator(ADIntegrator):
             # ------ Evaluate BSDF * cos(theta) and sample direction -------
 
             bsdf_val, bsdf_pdf, bsdf_sample, bsdf_weight = bsdf.eval_pdf_sample(
-                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d(), active_next
+                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d(),
+                active & si.is_valid()  # at the last vertex, whether it is seen through counts
             )
 
             # --------------- Emitter sampling contribution ----------------
@@ -320,7 +322,7 @@ class NilIntegrator(ADIntegrator):
         while active:
             if space.quotient:
                 p = mi.Point3f(geometry.wrap(p, space.twist)[0])
-            hit = tracer.intersect(p, v, cone, tracer.reach(p, v) - spent, active, time)
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, spent), active, time)
             si = surface_interaction(hit, v, space, mi.Color0f())
             active &= hit.valid & (si.shape.emitter() != None)  # noqa: E711
             p = dr.select(active, offset(si.p, si.n, hit.arrival, space), p)

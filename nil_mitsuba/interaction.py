@@ -52,7 +52,12 @@ def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
         t = dr.mulsign(dr.cross(n, s), handedness)
         si.sh_frame = mi.Frame3f(s, t, n)
 
-    incoming = dr.select(hit.valid, hit.arrival, start_direction)
+    # A geodesic that only grazes a surface may turn away from it within the tolerance, where the
+    # line that was traced goes through: what was hit from one side is seen from that side.
+    line = mi.Vector3f(hit.ray.d) if space.flat else geometry.to_frame(p, hit.ray.d, k)
+    same_side = dr.dot(hit.arrival, si.n) * dr.dot(line, si.n) > 0
+    arrival = dr.select(same_side, hit.arrival, dr.normalize(mi.Vector3f(line)))
+    incoming = dr.select(hit.valid, arrival, start_direction)
     si.wi = dr.select(hit.valid, si.to_local(-incoming), -incoming)
     return si
 
@@ -61,13 +66,13 @@ def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, space: Space) -> mi.Po
     """Start (cells) of a ray that leaves a surface point ``p`` (scene) in frame direction ``d``.
 
     The point is moved by Mitsuba's own ray epsilon, to the side that ``d`` points to, along the
-    metric dual of the conormal ``n`` (frame components).
+    surface's Euclidean normal, which is got back from the conormal ``n`` (frame components). The
+    metric dual of ``n`` would lead through walls that meet this one at a right angle.
     """
     # drjit's machine epsilon × 1500, as Mitsuba's math::RayEpsilon
     epsilon = 1500 * 2**-24
     distance = (1 + dr.max(dr.abs(p))) * epsilon
-    normal = dr.mulsign(mi.Vector3f(n), dr.dot(n, d))
     cells = space.to_cells(p)
-    return cells + mi.Point3f(geometry.from_frame(cells, normal, space.twist)) * (
-        distance / space.size
-    )
+    normal = mi.Vector3f(n.x, dr.fma(-space.twist * cells.x, n.z, n.y), n.z)
+    normal = dr.mulsign(dr.normalize(normal), dr.dot(n, d))
+    return cells + mi.Point3f(normal) * (distance / space.size)

@@ -54,15 +54,19 @@ class Images:
     The light that an image brings goes with 1/A, A its area density. Seen from p, the image has
     the horizontal offset (x, y) and the symmetric height z. With 1/A ~ 1/(r² + z²) near p, and
     A growing like k² r⁴ far off, x is drawn from a density ~ 1/(s + |x|), y from 1/√(s² + x² + y²)
-    and z from a Cauchy density as wide as r (1 + k r/6), all cut off where an image is certainly
-    beyond ``max_distance``. An image's probability is that of its own unit interval: differences
-    of closed-form distribution functions. The nearest image gets a share of its own.
+    and z from a Cauchy density as wide as r (1 + k r/6), or from one about ±2π/k, where geodesics
+    meet again near a fibre; all cut off where an image is certainly beyond ``max_distance``. An
+    image's probability is that of its own unit interval: differences of closed-form distribution
+    functions. The nearest image and the nearest column of images get shares of their own.
     """
 
-    # Half a cell: below, an image's interval does not tell 1/A from a constant.
-    SOFTENING = 0.5
-    # 1/A of the nearest image against the sum over all others, ~ 4π × a few cells of free path.
-    NEAREST = 30
+    # All three by experiment, against a choice in proportion to 1/A (examples/emitter_sampling.py).
+    # Cells: below, an image's interval does not tell 1/A from a constant.
+    SOFTENING = 0.3
+    # Cells: where the column of images along one fibre is as bright as all the others.
+    COLUMN = 0.02
+    # 1/A of the nearest image against the sum over all others, ~ 4π × five cells of free path.
+    NEAREST = 60
 
     def __init__(self, space: Space, max_distance: float):
         k = abs(space.twist_number)
@@ -70,6 +74,12 @@ class Images:
         self.radius = dr.opaque(mi.Float, max_distance + 0.5)
         # |Z~| ≤ T + k T² (u − sin u)/2u², and the last factor is below 0.16
         self.height = dr.opaque(mi.Float, max_distance * (1 + 0.16 * k * max_distance) + 0.5)
+        # Near a fibre the light that comes from beyond the height 2π/k is to that from below as
+        # (2/π) atan √((k T/2π)² − 1) to 1 (∫ dz/A); a tenth before, as A falls towards it.
+        beyond = 2 / math.pi * math.atan(math.sqrt(max((k * max_distance / (2 * math.pi)) ** 2 - 1,
+                                                       0)))
+        self.focused = dr.opaque(mi.Float, max(beyond / (1 + beyond), 0.1) if k else 0)
+        self.focus = dr.opaque(mi.Float, 2 * math.pi / k if k else 1)
 
     def _height_offset(self, p, q, gx, gy):
         """Symmetric height of g·q seen from p, without its integer part g_z."""
@@ -83,31 +93,54 @@ class Images:
         r = dr.sqrt(dr.fma(y, y, dr.square(rho)))
         return rho, r * dr.fma(dr.abs(self.space.twist) / 6, r, 1)
 
+    def _focus_share(self, x, y):
+        """Share of the heights about ±2π/k, where geodesics near a fibre meet again."""
+        return self.focused / (1 + 0.25 * dr.square(self.space.twist) * (x * x + y * y))
+
+    def _about_focus(self, z):
+        """Angle of a height ≥ 0 in the Cauchy density about 2π/k, a third as wide."""
+        return dr.atan((z - self.focus) * 3 / self.focus)
+
     def _nearest(self, p, q):
         gx, gy = -dr.round(q.x - p.x), -dr.round(q.y - p.y)
         offset, x, y = self._height_offset(p, q, gx, gy)
         gz = -dr.round(offset)
         square = dr.square(x) + dr.square(y) + dr.square(offset + gz)
-        return mi.Vector3i(gx, gy, gz), dr.rcp(dr.fma(self.NEAREST, square, 1))
+        # Both shares vanish where two are equally near, at |x|, |y| or |z| = 1/2: rounding decides
+        # between them there, and not always as it did when the light was sampled.
+        share = dr.maximum(1 - 4 * square, 0) / dr.fma(self.NEAREST, square, 1)
+        across = dr.square(x) + dr.square(y)
+        # At most half: what a column brings from below the focus does not grow without bound.
+        column = dr.maximum(1 - 4 * across, 0) * self.COLUMN / (2 * self.COLUMN + dr.sqrt(across))
+        return mi.Vector3i(gx, gy, gz), share, column
 
     def choose(self, p: mi.Point3f, q: mi.Point3f, u1: mi.Float, u2: mi.Point2f
                ) -> tuple[mi.Vector3i, mi.Float]:
         """A deck element and its probability."""
         s, R, Z = self.SOFTENING, self.radius, self.height
-        near, share = self._nearest(p, q)
+        near, share, column = self._nearest(p, q)
         take_near = u1 < share
         u1 = (u1 - share) / (1 - share)
+        take_column = u1 < column
+        u1 = (u1 - column) / (1 - column)
         u1, u2, u3 = (2 * u - 1 for u in (u1, u2.x, u2.y))
 
         x = dr.copysign(s * (dr.exp(dr.abs(u1) * dr.log(1 + R / s)) - 1), u1)
-        gx = dr.round(x - (q.x - p.x))
+        gx = dr.select(take_column, mi.Float(near.x), dr.round(x - (q.x - p.x)))
         _, dx, _ = self._height_offset(p, q, gx, 0)
         rho, _ = self._scales(dx, 0)
         y = rho * dr.sinh(u2 * dr.asinh(R / rho))
-        gy = dr.round(y - (q.y - p.y))
+        gy = dr.select(take_column, mi.Float(near.y), dr.round(y - (q.y - p.y)))
         offset, dx, dy = self._height_offset(p, q, gx, gy)
         _, sigma = self._scales(dx, dy)
-        z = sigma * dr.tan(u3 * dr.atan(Z / sigma))
+        focused = self._focus_share(dx, dy)
+        u4 = dr.abs(u3)
+        take_focus = u4 < focused
+        u4 = dr.select(take_focus, u4 / focused, (u4 - focused) / (1 - focused))
+        angle = dr.lerp(self._about_focus(mi.Float(0)), self._about_focus(Z), u4)
+        z = dr.select(take_focus, self.focus * (1 + dr.tan(angle) / 3),
+                      sigma * dr.tan(u4 * dr.atan(Z / sigma)))
+        z = dr.copysign(z, u3)
         gz = dr.round(z - offset)
 
         g = dr.select(take_near, near, mi.Vector3i(gx, gy, gz))
@@ -116,7 +149,7 @@ class Images:
     def probability(self, p: mi.Point3f, q: mi.Point3f, g: mi.Vector3i) -> mi.Float:
         """Probability with which `choose` draws the deck element ``g``."""
         s, R, Z = self.SOFTENING, self.radius, self.height
-        near, share = self._nearest(p, q)
+        near, share, column = self._nearest(p, q)
         gx, gy, gz = (mi.Float(c) for c in g)
         offset, x, y = self._height_offset(p, q, gx, gy)
         z = offset + gz
@@ -128,12 +161,20 @@ class Images:
         def in_x(t):
             return dr.copysign(dr.log(1 + dr.abs(t) / s), t)
 
-        far = (
+        def in_z(t):
+            low, high = self._about_focus(mi.Float(0)), self._about_focus(Z)
+            about = (self._about_focus(dr.abs(t)) - low) / (high - low)
+            return dr.copysign(dr.lerp(dr.atan(dr.abs(t) / sigma) / dr.atan(Z / sigma), about,
+                                       self._focus_share(x, y)), t)
+
+        across = (
             interval(in_x, x, R) / (2 * dr.log(1 + R / s))
             * interval(lambda t: dr.asinh(t / rho), y, R) / (2 * dr.asinh(R / rho))
-            * interval(lambda t: dr.atan(t / sigma), z, Z) / (2 * dr.atan(Z / sigma))
         )
-        is_near = (g.x == near.x) & (g.y == near.y) & (g.z == near.z)
+        is_column = (g.x == near.x) & (g.y == near.y)
+        across = dr.fma(1 - column, across, dr.select(is_column, column, 0))
+        far = across * interval(in_z, z, Z) / 2
+        is_near = is_column & (g.z == near.z)
         return dr.fma(1 - share, far, dr.select(is_near, share, 0))
 
 

@@ -93,15 +93,16 @@ class Tracer:
 
     # ------------------------------------------------------------------ lengths
 
-    def reach(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
+    def reach(self, p: mi.Point3f, v: mi.Vector3f, spent: mi.Float = 0) -> mi.Float:
         """Arc length (cells) past which the geodesic cannot meet the scene's box any more.
 
+        At most ``max_distance``, less what is ``spent`` of it.
         With B and H the horizontal and symmetric-vertical extent of the box seen from p, a point
         inside has |Z~| ≤ H and horizontal distance ≤ B, while |Z~| ≥ (|w| + c²/2|w|) t − c B/2|w|
         along the geodesic; hence t ≤ (2 |w| H + c B)/(1 + w²).
         """
         if self.space.quotient:
-            return mi.Float(self.max_distance)
+            return self.max_distance - spent
         far = dr.maximum(dr.abs(self.lower - p), dr.abs(self.upper - p))
         k = dr.abs(self.space.twist)
         c = dr.hypot(v.x, v.y)
@@ -109,7 +110,7 @@ class Tracer:
         height = far.z + k * far.y * (dr.abs(p.x) + 0.5 * far.x)
         bound = (2 * w * height + c * dr.hypot(far.x, far.y)) / (1 + w * w)
         # one part in a thousand and a little more against rounding
-        return dr.minimum(1.001 * bound + 1e-3, self.max_distance)
+        return dr.minimum(1.001 * bound + 1e-3, self.max_distance - spent)
 
     def outside(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
         """Arc length (cells) that certainly does not meet the scene's box; 0 inside it."""
@@ -177,6 +178,7 @@ class Tracer:
         # Refinement: the tangent at arc length ``at`` is searched over ± ``window``.
         refining = mi.Bool(False)
         at, window = mi.Float(0), mi.Float(0)
+        side = mi.Float(0)
         cell = mi.Vector3i(0)
 
         valid = mi.Bool(False)
@@ -241,6 +243,12 @@ class Tracer:
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~empty)
 
             # --------------------------- What it met ---------------------------
+            # A tangent that meets a surface from the other side than the chord did has found where
+            # the geodesic comes back, or what lies behind its start.
+            met = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, pi.valid & ~cone.soft)
+            facing = dr.sign(dr.dot(met.n, d))
+            there = pi.valid & (~refining | (facing == side))
+            side = dr.select(~refining & pi.valid, facing, side)
             s = s_first + (pi.t / space.size - before) / dr.maximum(speed, 1e-20)
             c = dr.hypot(v.x, v.y)
             bend = dr.abs(k) * c * dr.sqrt(dr.fma(dr.square(v1.x), dr.square(v1.y), v.z * v.z))
@@ -250,9 +258,9 @@ class Tracer:
             error = bend * dr.select(refining, 0.5 * dr.square(s), 0.125 * dr.square(scale))
             error = dr.select(sideways & ~refining, dr.inf, error)
             goal = dr.fma(0.004, dr.fma(cone.spread, t_hit, cone.width), 4e-6)
-            accept = pi.valid & (cone.soft | (error <= goal))
-            redo = refining & ~pi.valid
-            look = pi.valid & ~accept
+            accept = there & (cone.soft | (error <= goal))
+            redo = refining & ~there
+            look = there & ~accept
             window = dr.select(
                 look,
                 dr.select(refining, dr.minimum(0.5 * window, 256 * error),
@@ -260,7 +268,7 @@ class Tracer:
                 window,
             )
             at = dr.select(look, t_hit, at)
-            missed = ~refining & ~pi.valid
+            missed = ~refining & ~there
             cap = dr.select(redo, 0.125 * scale, cap)
 
             # What a step sideways has met stays where the tangent there finds nothing better.
@@ -282,8 +290,7 @@ class Tracer:
             refining = look
             active &= ~accept & ~(missed & (t0 >= reach))
 
-        return Hit(valid, distance, turned(v, k * v.z * distance), cell,
-                   ray_found, found)
+        return Hit(valid, distance, turned(v, k * v.z * distance), cell, ray_found, found)
 
     @dr.syntax
     def occluded(self, p: mi.Point3f, v: mi.Vector3f, cone: Cone, reach: mi.Float,

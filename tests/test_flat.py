@@ -243,11 +243,15 @@ def test_flat_texture_of_emission_has_the_expectation_of_path(rgb):
 
 
 def hidden_emitters(pixel_format):
-    """A lamp before a ball, a lamp before nothing, a ball behind glass, one behind a mask."""
+    """Boxes behind a lamp, glass, a mask and nothing, which are smaller than the boxes."""
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 3}}
+    tilt = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 40).scale(0.6)
+
     def behind(thing):
         return lambda to_world: [
-            {"type": "sphere", "to_world": to_world},
+            # A mesh: behind a hidden light, `path` takes the distance from the light for that from
+            # the camera, and misplaces its hits on shapes that are found by distance.
+            {"type": "cube", "to_world": to_world @ tilt},
             {"type": "disk", "to_world": mi.ScalarTransform4f().translate([0, 0, 1]) @ to_world
              @ mi.ScalarTransform4f().scale(0.6)} | thing]
     tile = [behind({"light": lamp}), behind({"bsdf": {"type": "thindielectric"}}),

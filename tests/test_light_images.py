@@ -285,7 +285,8 @@ def test_point_light_in_a_hard_place_leaves_a_finite_image(rgb, twist, quotient)
 def test_area_light_that_touches_surfaces_leaves_a_finite_image(rgb, twist):
     """In the floor's own plane, through a ball, across the cell's faces."""
     T = mi.ScalarTransform4f()
-    for place in (T.translate([0.5, 0.5, 0.03]).scale(0.2), T.translate([0.6, 0.55, 0.3]).scale(0.3),
+    for place in (T.translate([0.5, 0.5, 0.03]).scale(0.2),
+                  T.translate([0.6, 0.55, 0.3]).scale(0.3),
                   T.translate([1, 0.5, 0.5]).rotate([0, 1, 0], 90).scale(0.2)):
         for quotient in (False, True):
             render_without_fireflies(twist, quotient, lamp={
@@ -346,7 +347,8 @@ def test_hundreds_of_lights_shine_as_their_sum_does(rgb):
                                "intensity": 1.0 / copies}
             lights[f"q{i}"] = {"type": "point", "position": [0.8, 0.2, 0.7],
                                "intensity": 2.0 / copies}
-            lights[f"a{i}"] = {"type": "rectangle", "to_world": downward(0.45, 0.5, 0.93).scale(0.1),
+            lights[f"a{i}"] = {"type": "rectangle",
+                               "to_world": downward(0.45, 0.5, 0.93).scale(0.1),
                                "emitter": area(*[5.0 / copies] * 3)}
         return lights
 
@@ -364,8 +366,8 @@ def test_hundreds_of_lights_shine_as_their_sum_does(rgb):
 
 def test_three_hundred_panels_leave_a_finite_image(rgb):
     panels = {f"a{i}": {"type": "rectangle", "emitter": area(1, 2, 3),
-                        "to_world": downward(0.05 + 0.9 * (i % 20) / 20, 0.05 + 0.9 * (i // 20) / 15,
-                                             0.9).scale(0.015)} for i in range(300)}
+                        "to_world": downward(0.05 + 0.9 * (i % 20) / 20,
+                                             0.05 + 0.9 * (i // 20) / 15, 0.9).scale(0.015)} for i in range(300)}
     image = render_without_fireflies(1, True, **panels)
     assert dr.mean(image.array)[0] > 0
 

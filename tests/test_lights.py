@@ -90,7 +90,7 @@ def lights(twist, quotient, max_distance, **scene):
 
 
 class Strata:
-    """A sampler whose second number pair runs through equal steps, so that means are quadratures."""
+    """A sampler whose number pairs run through equal steps, so that means are quadratures."""
 
     def __init__(self, count, copies=1):
         self.u = (mi.Float(dr.arange(mi.UInt32, count * copies) % count) + 0.5) / count
@@ -305,8 +305,8 @@ def images_within(p, q, twist, reach):
 
 
 def all_geodesics(p, q, twist, reach):
-    """Index, direction and distance of every geodesic within ``reach`` from p to points q (float64),
-    by a scan of 1,000 steps per π of the half turn. Twist 0: the straight lines."""
+    """Index, direction and distance of every geodesic within ``reach`` from p to points q, in
+    float64 by a scan of 1,000 steps per π of the half turn. Twist 0: the straight lines."""
     p = Array3f64(*p)
     count = dr.width(q)
     if twist == 0:
