@@ -1,7 +1,5 @@
 """Single rays of the tracer against float64 root finding that shares no code with it."""
 
-import math
-
 import drjit as dr
 import pytest
 import truth
@@ -83,6 +81,65 @@ def test_every_ray_names_the_true_surface(rgb, kind, twist):
     assert error <= 1
     finer = compare(rgb, kind, twist, 0.25 / 4)
     assert twist == 0 or finer[1] < close
+
+
+def check_that_rays_end(mi, p, v, twist):
+    """Each ray ends by a hit within the cube or at ``max_distance``, with finite values."""
+    from nil_mitsuba.interaction import surface_interaction
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Cone, Tracer
+
+    scene = mi.load_dict({"type": "scene", **truth.to_mitsuba(truth.cell_scene(), mi)})
+    tracer = Tracer(scene, Space(twist, True, [0, 0, 0], 1.0), 12.0)
+    hit = tracer.intersect(p, v, Cone(0, 3e-4), tracer.reach(p, v), mi.Bool(True))
+    si = surface_interaction(hit, v, tracer.space, mi.Color0f())
+    dr.eval(hit, si)
+    assert dr.all(~hit.valid | ((hit.distance >= 0) & (hit.distance <= 12)))
+    assert dr.all(~hit.valid | dr.all((si.p > -1e-4) & (si.p < 1 + 1e-4)))
+    assert dr.all(~hit.valid | (dr.abs(dr.norm(hit.arrival) - 1) < 1e-5))
+    assert dr.all(~hit.valid | (dr.abs(dr.norm(si.wi) - 1) < 1e-4))
+    # Most rays of this scene hit something: an empty result would pass the lines above.
+    assert dr.count(hit.valid)[0] > 0.2 * dr.width(p)
+
+
+@pytest.mark.parametrize("twist", [0, 1, -2])
+def test_aimed_rays_end(rgb, twist):
+    """Through corners and edges, along faces and edges, horizontal and vertical."""
+    mi, count = rgb, 60_000
+    random = mi.PCG32(count)
+
+    def number():
+        return random.next_float32()
+
+    whole = [mi.Float(dr.floor(5 * number())) - 2 for _ in range(3)]
+    p = mi.Point3f(number(), number(), number())
+    starts = {
+        "corner": (p, mi.Vector3f(mi.Point3f(*whole) - p)),
+        "edge": (p, mi.Vector3f(whole[0] - p.x, whole[1] - p.y, number() - 0.5)),
+        "along a face": (mi.Point3f(0, p.y, p.z), mi.Vector3f(0, number() - 0.5, number() - 0.5)),
+        "along an edge": (mi.Point3f(p.x, 0, 0), mi.Vector3f(dr.sign(number() - 0.5), 0, 0)),
+        "horizontal": (p, mi.Vector3f(number() - 0.5, number() - 0.5, 0)),
+        "vertical": (p, mi.Vector3f(0, 0, dr.sign(number() - 0.5))),
+    }
+    p = [dr.concat([mi.Float(start[0][i]) + dr.zeros(mi.Float, count)
+                    for start in starts.values()]) for i in range(3)]
+    v = [dr.concat([mi.Float(start[1][i]) + dr.zeros(mi.Float, count)
+                    for start in starts.values()]) for i in range(3)]
+    v = mi.Vector3f(*v)
+    v = dr.select(dr.norm(v) > 1e-6, dr.normalize(v), mi.Vector3f(0, 0, 1))
+    check_that_rays_end(mi, mi.Point3f(*p), v, twist)
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("twist", [0, 1, 2, -3])
+def test_ten_million_random_rays_end(rgb, twist):
+    mi = rgb
+    for seed in range(3):
+        random = mi.PCG32(1_000_000, seed)
+        p = mi.Point3f(*(random.next_float32() for _ in range(3)))
+        v = mi.warp.square_to_uniform_sphere(
+            mi.Point2f(random.next_float32(), random.next_float32()))
+        check_that_rays_end(mi, p, v, twist)
 
 
 if __name__ == "__main__":
