@@ -19,9 +19,9 @@ from .tracer import Cone, Tracer
 PASS_SAMPLES = 2**21
 
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
-# of tolerance; its lobe blurs what lies behind it. From the bent Cornell box: halving it moves the
-# mean by less than 0.1 % and costs a fifth more time.
-ROUGH_SPREAD = 0.4
+# of tolerance; its lobe blurs what lies behind it. On the bent Cornell box halving it moves the
+# mean by less than 0.1 % and costs a tenth more time.
+ROUGH_SPREAD = 0.8
 # A lobe narrower than this (radians) is a mirror's for the tracer: hits stay exact behind it.
 SOFT_LOBE = 0.1
 
