@@ -17,7 +17,7 @@ mi.set_variant("llvm_ad_rgb")
 
 
 def bent_box(width, **properties):
-    """Mitsuba's Cornell box with ``nil`` as the issue of its cost is usually put: one cell."""
+    """Mitsuba's Cornell box in plain Nil, one cell wide."""
     scene = mi.cornell_box()
     scene["sensor"]["film"]["width"] = scene["sensor"]["film"]["height"] = width
     scene["integrator"] = {
@@ -37,8 +37,6 @@ def seconds(scene, spp, seed):
 
 
 def against_path(width, spp, rounds):
-    straight = bent_box(width)
-    del straight
     scene = mi.cornell_box()
     scene["sensor"]["film"]["width"] = scene["sensor"]["film"]["height"] = width
     scene["integrator"] = {"type": "path", "max_depth": 6}
