@@ -8,10 +8,10 @@ import math
 import resource
 import time
 
-import nil_mitsuba  # noqa: F401, I001 - before mitsuba: it chooses LLVM
-
 import drjit as dr
 import mitsuba as mi
+
+import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses LLVM
 
 mi.set_variant("llvm_ad_rgb")
 

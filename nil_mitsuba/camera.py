@@ -46,7 +46,8 @@ class Camera:
             children = [key[: -len(".shutter_open")] for key in parameters.keys()
                         if key.endswith(".shutter_open")]
             for child in children:
-                if f"{child}.to_world" not in parameters or f"{child}.aperture_radius" in parameters:
+                turned = f"{child}.to_world" in parameters
+                if not turned or f"{child}.aperture_radius" in parameters:
                     raise RuntimeError(
                         f'the integrator "nil" renders perspective and orthographic sensors inside '
                         f'a batch, and "{child}" is neither: render it as a sensor of its own.'

@@ -152,8 +152,8 @@ class NilIntegrator(ADIntegrator):
 
         They do not say which sensor the ray is from: it is taken for a ray of the scene's first.
         """
-        mi.Log(mi.LogLevel.Warn, "nil: an integrator around this one (aov) traces its own layers "
-                                 "along straight rays.")
+        mi.Log(mi.LogLevel.Warn, "nil: inside another integrator; if that is aov, its own layers "
+                                 "are traced straight.")
         view = View(scene, self)
         camera = Camera(scene.sensors()[0], view.space, self.tolerance)
         p, v, cone = camera.start(ray, mi.Vector2f(0))
@@ -164,7 +164,9 @@ class NilIntegrator(ADIntegrator):
         return radiance, valid, [], None
 
     def render_forward(self, *_, **__):
-        raise RuntimeError('the integrator "nil" offers no gradients: render_forward is not available.')
+        raise RuntimeError(
+            'the integrator "nil" offers no gradients: render_forward is not available.'
+        )
 
     def render_backward(self, *_, **__):
         raise RuntimeError(

@@ -28,8 +28,9 @@ def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
     """Surface interaction of a geodesic's hit: ``p`` in scene coordinates, all directions in frame.
 
     ``n``, ``sh_frame``, ``dp_du``, ``dp_dv`` and ``wi`` are frame components (Mitsuba computes no
-    ``dn_du``, ``dn_dv`` here), ``t`` is the geodesic's length in scene units. Where nothing was hit, ``wi`` points against the
-    direction in which the segment *started*: environments are looked up by it.
+    ``dn_du``, ``dn_dv`` here), ``t`` is the geodesic's length in scene units. Where nothing was
+    hit, ``wi`` points against the direction in which the segment *started*: environments are
+    looked up by it.
     """
     si = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
     si.wavelengths = wavelengths

@@ -14,7 +14,6 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
-from .interaction import unit_conormal
 from .quotient import Space
 from .tracer import Hit
 
@@ -31,8 +30,9 @@ class LightSample:
     """Light that may arrive at a vertex.
 
     ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
-    it, infinite for directional light; ``target`` (cells): the point on an area light; ``weight``: radiance over probability; ``pdf``: with
-    respect to solid angle, 0 for ``delta`` light, which no other technique finds.
+    it, infinite for directional light; ``target`` (cells): the point on an area light;
+    ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
+    light, which no other technique finds.
     """
 
     DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "target": mi.Point3f,
@@ -387,7 +387,7 @@ class Lights:
 
         density = geometry.area_density(hit.distance, hit.arrival.z, space.twist)
         density *= dr.square(space.size)
-        # The conormal's length from the Nil unit normal: |N| = 1/|n − k x nz e1·…| of its inverse
+        # |N| is lost in the Nil unit normal, which has length 1/|N| as a Euclidean normal.
         back = mi.Vector3f(si.n.x, si.n.y - space.twist * q.x * si.n.z, si.n.z)
         stretch = dr.rcp(dr.norm(back))
         cosine = dr.abs(dr.dot(si.n, hit.arrival))

@@ -73,7 +73,7 @@ def exit_through_face(p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vecto
 
 def through_face(p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, face: mi.Vector3i,
                  space: Space) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
-    """Carry a point ``p`` on a face, points that belong to it and the deck element into the next cell.
+    """Carry a point ``p`` on a face, ``others`` that belong to it and ``cell`` into the next cell.
 
     ``face`` is zero in lanes that stay. Crossing x = 0 or 1 shears z by k y, which can leave
     [0, 1) on either side whatever the direction of the ray, so z is reduced at once.

@@ -16,10 +16,10 @@ import mitsuba as mi
 from . import geometry
 from .quotient import Space, exit_through_face, opaque, through_face
 
-
 # Chords keep within this part of the cone. What a chord has missed cannot be found again, while
 # what it has met by mistake can, so the error is one-sided: a tenth keeps an image's mean.
 SAGITTA = 0.1
+
 
 class Cone:
     """How far off a ray may be: ``width`` + ``spread`` · distance (cells), as a pixel's cone.
@@ -97,6 +97,7 @@ class Tracer:
         """Arc length (cells) past which the geodesic cannot meet the scene's box any more.
 
         At most ``max_distance``, less what is ``spent`` of it.
+
         With B and H the horizontal and symmetric-vertical extent of the box seen from p, a point
         inside has |Z~| ≤ H and horizontal distance ≤ B, while |Z~| ≥ (|w| + c²/2|w|) t − c B/2|w|
         along the geodesic; hence t ≤ (2 |w| H + c B)/(1 + w²).
@@ -305,7 +306,6 @@ class Tracer:
         quotient = space.quotient
         vertex, end = mi.Point3f(p), mi.Point3f(p)
         t0, t1 = mi.Float(0), mi.Float(0)
-        cell = mi.Vector3i(0)
         blocked = mi.Bool(False)
         active = active & (reach > 0)
         stretch = dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3)
@@ -347,6 +347,6 @@ class Tracer:
             vertex = dr.select(leaves, dr.fma(along, s_last, vertex), end)
             if quotient:
                 face = dr.select(leaves, face, 0)
-                vertex, (end,), cell = through_face(vertex, [end], cell, face, space)
+                vertex, (end,), _ = through_face(vertex, [end], mi.Vector3i(0), face, space)
             active &= ~hit & (t0 < reach)
         return blocked

@@ -3,10 +3,10 @@
 Run as a script, it prints the worst errors of ``nil_mitsuba.geometry`` beside their limits.
 """
 
-from functools import lru_cache
+import random
+from functools import cache
 from itertools import product
 from math import hypot, inf, pi, sqrt
-import random
 
 import drjit as dr
 from mpmath import mp, mpf
@@ -25,7 +25,7 @@ def _circle_functions(u):
     return mp.sin(u) / u, (1 - mp.cos(u)) / u, (u - mp.sin(u)) / u**2
 
 
-@lru_cache(maxsize=None)
+@cache
 def flow(p, v, t, k):
     """Closed form with the full turn u = k w t, for directions of any length."""
     (x, y, z), (a, b, w), t, k = map(mpf, p), map(mpf, v), mpf(t), mpf(k)
@@ -37,7 +37,7 @@ def flow(p, v, t, k):
     return ((x + X, y + Y, z + Z + k*x*Y), (a*cos_u - b*sin_u, b*cos_u + a*sin_u, w))
 
 
-@lru_cache(maxsize=None)
+@cache
 def area_density(t, w, k):
     """Jacobian of the exponential map by differences of ``flow``, without the closed form of A."""
     t, w, k = mpf(t), mpf(w), mpf(k)
@@ -54,7 +54,7 @@ def area_density(t, w, k):
     return mp.det(mp.matrix([rows[0], rows[1], end]))
 
 
-@lru_cache(maxsize=None)
+@cache
 def connect(p, q, k):
     """(direction, arrival, distance) by bisection for the half turn; None where they coincide."""
     (px, py, pz), (qx, qy, qz), k = map(mpf, p), map(mpf, q), mpf(k)

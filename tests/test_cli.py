@@ -213,7 +213,8 @@ def test_meshes_includes_and_constants_are_found_from_any_folder(command, folder
             SENSOR,
         )
     )
-    status, _, err = command("render", "a/scene.xml", "-D", "mesh=parts/triangle.obj", "-D", "spp=16")
+    status, _, err = command("render", "a/scene.xml", "-D", "mesh=parts/triangle.obj",
+                             "-D", "spp=16")
     assert status == 0, err
     header, _, pixels = read("a/scene.exr")
     assert header["spp"] == 16

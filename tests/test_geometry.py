@@ -1,16 +1,17 @@
 """Nil's geometry against mpmath, against its own metric and against its symmetries."""
 
+import random
 from fractions import Fraction
 from math import cos, floor, inf, isfinite, log2, pi, sin, sqrt
-import random
 
 import drjit as dr
-from hypothesis import assume, given, settings, strategies as st
 import mitsuba as mi
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
-from nil_mitsuba import geometry
 import reference_geometry as reference
+from nil_mitsuba import geometry
 
 ARRAYS = [dr.llvm.Array3f, dr.llvm.Array3f64, dr.scalar.Array3f, dr.scalar.Array3f64]
 every_array = pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
+
 from studio import film, gradient, texture, without_emitter_sampling, write_ply
 from ztest import POOLED_Z, Estimate, assert_same_expectation, z_scores
 
@@ -367,7 +368,8 @@ def test_hundreds_of_lights_shine_as_their_sum_does(rgb):
 def test_three_hundred_panels_leave_a_finite_image(rgb):
     panels = {f"a{i}": {"type": "rectangle", "emitter": area(1, 2, 3),
                         "to_world": downward(0.05 + 0.9 * (i % 20) / 20,
-                                             0.05 + 0.9 * (i // 20) / 15, 0.9).scale(0.015)} for i in range(300)}
+                                             0.05 + 0.9 * (i // 20) / 15, 0.9).scale(0.015)}
+              for i in range(300)}
     image = render_without_fireflies(1, True, **panels)
     assert dr.mean(image.array)[0] > 0
 

@@ -12,9 +12,10 @@ import random
 import drjit as dr
 import mitsuba as mi
 import pytest
+from drjit.llvm import Array3f64, Bool, Float64, UInt32
+
 import reference_geometry as reference
 import truth
-from drjit.llvm import Array3f64, Bool, Float64, UInt32
 
 POOLED_Z = 3.5  # one in 2,100 sound estimates is further off
 

@@ -5,6 +5,7 @@ import re
 
 import drjit as dr
 import pytest
+
 from conftest import ROOT
 
 SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.xml"))

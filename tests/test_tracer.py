@@ -2,14 +2,15 @@
 
 import drjit as dr
 import pytest
-import truth
 from drjit.llvm import Array3f64, Array3i
+
+import truth
 
 WIDTH = HEIGHT = 512
 
 
 def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH):
-    """Primary rays through the pixel centres of a square image, as the integrator would start them."""
+    """Primary rays through the pixel centres of a square image, as the integrator starts them."""
     from nil_mitsuba.camera import Camera
     from nil_mitsuba.quotient import Space
     from nil_mitsuba.tracer import Tracer
@@ -143,8 +144,9 @@ def test_ten_million_random_rays_end(rgb, twist):
 
 
 if __name__ == "__main__":
-    import nil_mitsuba  # noqa: F401
     import mitsuba
+
+    import nil_mitsuba  # noqa: F401
 
     mitsuba.set_variant("llvm_ad_rgb")
     print("scene     twist  tolerance  far from silhouettes  near them  error / allowance")
