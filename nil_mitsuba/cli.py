@@ -297,20 +297,24 @@ def _resolver(mi, folder: Path):
 
 def _render(integrator, scene, sensor: int, seed: int, spp: int | None) -> int:
     """Fill the sensor's film, with a progress bar if stderr is a terminal; samples per pixel."""
-    total = spp or scene.sensors()[sensor].sampler().sample_count()
-    if not hasattr(integrator, "passes"):  # a wrapper of Mitsuba's renders in one go
+    if not hasattr(integrator, "view"):  # a wrapper of Mitsuba's renders in one go
         integrator.render(scene, sensor, seed=seed, spp=spp or 0, develop=False)
-        return total
+        return spp or scene.sensors()[sensor].sampler().sample_count()
 
     from tqdm import tqdm
 
-    done = 0
+    from .passes import Passes
+
+    passes = Passes(integrator, scene, sensor, seed, spp or 0)
     form = "{percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} samples per pixel, {remaining} left"
-    with tqdm(total=total, bar_format=form, disable=None) as progress:
-        for done in integrator.passes(scene, scene.sensors()[sensor], seed=seed, spp=spp or 0):
-            progress.total = max(total, done)  # some samplers round the count up
-            progress.update(done - progress.n)
-    return done
+    with tqdm(total=passes.count * passes.spp, bar_format=form, disable=None) as progress:
+        sums = passes.render(0)
+        progress.update(passes.spp)
+        for index in range(1, passes.count):
+            sums = sums.plus(passes.render(index))
+            progress.update(passes.spp)
+    passes.develop(sums)
+    return passes.count * passes.spp
 
 
 # ----------------------------------------------------------------------- output

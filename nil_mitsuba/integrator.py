@@ -12,11 +12,9 @@ from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
 from .lights import Lights
+from .passes import LAYERS, MEAN_LAYERS, Passes, layer_channels
 from .quotient import Space, multiply_cells
 from .tracer import Cone, Tracer
-
-# Camera samples in one pass: more use no processor better, and memory grows with them.
-PASS_SAMPLES = 2**21
 
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
 # of tolerance; its lobe blurs what lies behind it. On the bent Cornell box halving it moves the
@@ -36,7 +34,8 @@ class NilIntegrator(ADIntegrator):
     Parameters: ``max_depth`` (−1), ``rr_depth`` (5) and ``hide_emitters`` (false) as in ``path``;
     ``twist`` (1); ``quotient`` (true); ``cell_origin`` (0, 0, 0) and ``cell_size`` (1), in scene
     units; ``tolerance`` (0.25), in pixels; ``max_distance`` of one segment, in cells (12 in the
-    quotient, unlimited in plain Nil). It offers no gradients and no participating media.
+    quotient, unlimited in plain Nil); ``aovs``, layers to render beside the picture (none of them;
+    a list such as "distance, normal"). It offers no gradients and no participating media.
     """
 
     def __init__(self, props: mi.Properties):
@@ -62,6 +61,7 @@ class NilIntegrator(ADIntegrator):
         self.tolerance = _positive(props, "tolerance", 0.25)
         # Tests switch emitter sampling off: estimates are then exact where furnaces are.
         self.emitter_sampling = True
+        self.layers = _layers(props)
         self.max_distance = math.inf
         if self.quotient or "max_distance" in props:
             self.max_distance = _positive(props, "max_distance", 12.0)
@@ -79,73 +79,26 @@ class NilIntegrator(ADIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Render an image (mi.TensorXf); Mitsuba's entry, see ``mi.render``."""
-        sensor = _sensor(scene, sensor)
-        for _ in self.passes(scene, sensor, seed, spp):
-            pass
+        seed = int(seed[0]) if dr.is_array_v(seed) else int(seed)
+        passes = Passes(self, scene, sensor, seed, spp)
+        sums = passes.render(0)
+        for index in range(1, passes.count):
+            sums = sums.plus(passes.render(index))
+        image = passes.develop(sums)
         if not develop:
             return mi.TensorXf()
-        image = sensor.film().develop()
         if evaluate:
             dr.eval(image)
         return image
 
-    def passes(self, scene, sensor=0, seed=0, spp=0):
-        """Render pass by pass, yielding the samples per pixel that ``sensor``'s film holds so far.
-
-        The first pass is seeded with ``seed``, later ones with `pass_seed`. A pass is as large as
-        `PASS_SAMPLES` allows, but at least one sample per pixel.
-        """
-        sensor = _sensor(scene, sensor)
-        seed = int(seed[0]) if dr.is_array_v(seed) else int(seed)
-        film = sensor.film()
-        spp = spp or sensor.sampler().sample_count()
-        size = film.crop_size()
-        if film.sample_border():
-            size += 2 * film.rfilter().border_size()
-        per_pass = max(1, min(spp, PASS_SAMPLES // max(1, dr.prod(size))))
-
+    def view(self, scene: mi.Scene) -> View:
+        """The scene as this integrator's parameters show it."""
         _warn_of_what_is_ignored(scene, self)
-        view = View(scene, self)
-        camera = Camera(sensor, view.space, self.tolerance)
-        done, index = 0, 0
-        while done < spp:
-            with dr.suspend_grad():
-                # The sampler may round the count up; the last pass is a full one, so that one
-                # kernel does for all.
-                sampler, count = self._prepare_pass(sensor, pass_seed(seed, index), per_pass,
-                                                    first=index == 0)
-                ray, weight, position = self.sample_rays(scene, sensor, sampler)
-                p, v, cone = camera.start(ray, position)
-                radiance, valid = self._trace(view, sampler, ray, p, v, cone, mi.Bool(True))
-                block = film.create_block()
-                block.set_coalesce(block.coalesce() and count >= 4)
-                ADIntegrator._splat_to_block(
-                    block, film, position, value=radiance * weight, weight=1.0,
-                    alpha=dr.select(valid, mi.Float(1), mi.Float(0)), aovs=[],
-                    wavelengths=ray.wavelengths,
-                )
-                film.put_block(block)
-                del sampler, ray, weight, position, p, v, cone, radiance, valid, block
-                film.schedule_storage()
-                dr.eval()
-                dr.sync_thread()
-            done += count
-            index += 1
-            yield done
+        return View(scene, self)
 
-    def _prepare_pass(self, sensor, seed, spp, first):
-        film = sensor.film()
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(spp)
-        spp = sampler.sample_count()
-        sampler.set_samples_per_wavefront(spp)
-        size = film.crop_size()
-        if film.sample_border():
-            size += 2 * film.rfilter().border_size()
-        sampler.seed(dr.opaque(mi.UInt32, seed), dr.prod(size) * spp)
-        if first:
-            film.prepare([])
-        return sampler, spp
+    def aov_names(self) -> list[str]:
+        """Names of the channels that the layers add to the picture's."""
+        return layer_channels(self.layers)
 
     def sample(self, mode, scene, sampler, ray, active=True, **_):
         """One sample per ray, for integrators that wrap this one (``moment``, ``aov``).
@@ -160,8 +113,9 @@ class NilIntegrator(ADIntegrator):
         # Wrappers shrink the differentials with the sample count; the cone is a whole pixel's.
         scale = math.sqrt(sampler.sample_count())
         cone = Cone(cone.width * scale, cone.spread * scale)
-        radiance, valid = self._trace(view, sampler, ray, p, v, cone, mi.Bool(active))
-        return radiance, valid, [], None
+        radiance, valid, seen = self.trace(view, sampler, ray, p, v, cone, mi.Bool(active))
+        aovs = [mi.Float(channel) for layer in self.layers for channel in seen[layer]]
+        return radiance, valid, aovs, None
 
     def render_forward(self, *_, **__):
         raise RuntimeError(
@@ -176,11 +130,12 @@ class NilIntegrator(ADIntegrator):
     # ------------------------------------------------------------- path tracing
 
     @dr.syntax
-    def _trace(self, view: View, sampler: mi.Sampler, ray: mi.RayDifferential3f, p: mi.Point3f,
-               v: mi.Vector3f, cone: Cone, active: mi.Bool):
+    def trace(self, view: View, sampler: mi.Sampler, ray: mi.RayDifferential3f, p: mi.Point3f,
+              v: mi.Vector3f, cone: Cone, active: mi.Bool):
         """Radiance along the geodesics from ``p`` (cells) in frame direction ``v``.
 
-        Returns the radiance and whether the path met anything that makes its pixel opaque.
+        Returns the radiance, whether the path met anything that makes its pixel opaque, and the
+        channels of each layer at the path's first vertex.
         """
         scene, space, tracer = view.scene, view.space, view.tracer
         lights = view.lights
@@ -205,6 +160,7 @@ class NilIntegrator(ADIntegrator):
         bsdf_pdf_prev   = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
         spent           = mi.Float(0)          # Length of the camera segment before hidden lights
+        seen            = view.nothing_seen()  # Layers
 
         if self.hide_emitters:
             p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, active)
@@ -217,6 +173,8 @@ class NilIntegrator(ADIntegrator):
                 p, home = geometry.wrap(p, space.twist)
             hit = tracer.intersect(p, v, cone, tracer.reach(p, v, spent), active, ray.time)
             si = surface_interaction(hit, v, space, ray.wavelengths)
+
+            seen = view.see(seen, hit, si, home, spent, active & (depth == 0))
 
             # --------------------- Direct emission ---------------------
 
@@ -297,7 +255,7 @@ class NilIntegrator(ADIntegrator):
             rr_continue = sampler.next_1d() < rr_prob
             active = active_next & (~rr_active | rr_continue) & (β_max != 0)
 
-        return dr.select(valid, L, 0), valid
+        return dr.select(valid, L, 0), valid, seen
 
     def _visible(self, view, si, light, cone, active):
         """Whether nothing stands between a surface and the light drawn there."""
@@ -370,11 +328,50 @@ class View:
         self.tracer = Tracer(scene, self.space, integrator.max_distance)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
+        self.layers = integrator.layers
+        if "shape" in self.layers:
+            self._number_shapes()
 
+    def nothing_seen(self) -> dict[str, list]:
+        """The channels of each layer where a path meets nothing."""
+        return {layer: [mi.Float(0) if layer in MEAN_LAYERS else mi.Int32(-(layer == "shape"))
+                        for _ in LAYERS[layer]]
+                for layer in self.layers}
 
-def pass_seed(seed: int, index: int) -> int:
-    """Seed of pass number ``index``: ``seed`` itself, then steps of 2³² times the golden ratio."""
-    return (seed + index * 0x9E3779B9) % 2**32
+    def see(self, seen, hit, si, home, spent, first):
+        """The channels of each layer after a vertex, which counts where ``first``."""
+        first &= si.is_valid()
+        found = {}
+        for layer in self.layers:
+            if layer == "distance":
+                found[layer] = [(spent + hit.distance) * self.space.size]
+            elif layer == "position":
+                found[layer] = list(si.p)
+            elif layer == "normal":
+                found[layer] = list(si.sh_frame.n)
+            elif layer == "albedo":
+                bsdf = si.bsdf()
+                albedo = bsdf.eval_diffuse_reflectance(si, first)
+                # What only reflects and refracts shows other things' colours: white, for denoisers
+                smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                rgb = mi.spectrum_to_srgb(albedo, si.wavelengths) if mi.is_spectral else albedo
+                found[layer] = [dr.select(smooth, dr.clip(rgb[i % len(rgb)], 0, 1), 1)
+                                for i in range(3)]
+            elif layer == "cell":
+                found[layer] = list(multiply_cells(home, hit.cell, self.space))
+            elif layer == "shape":
+                shape = dr.select(si.instance == None, si.shape, si.instance)  # noqa: E711
+                number = dr.reinterpret_array(mi.UInt32, shape)
+                found[layer] = [dr.gather(mi.Int32, self.shape_numbers, number, first)]
+        return {layer: [dr.select(first, new, old) for new, old in zip(found[layer], seen[layer])]
+                for layer in self.layers}
+
+    def _number_shapes(self):
+        pointers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.scene.shapes()]
+        numbers = [-1] * (max(pointers, default=0) + 1)
+        for number, pointer in enumerate(pointers):
+            numbers[pointer] = number
+        self.shape_numbers = mi.Int32(numbers)
 
 
 # ------------------------------------------------------------------ parameters
@@ -423,5 +420,14 @@ def _point(props, name):
     return point
 
 
-def _sensor(scene, sensor):
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+def _layers(props):
+    """The chosen layers in the order of `LAYERS`, each once."""
+    text = props.get("aovs", "")
+    if not isinstance(text, str):
+        raise RuntimeError('The property "aovs" has the wrong type (expected <string>).')
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in LAYERS:
+            raise RuntimeError(f'"aovs" names the layer "{name}", which is none of '
+                               f"{', '.join(LAYERS)}")
+    return tuple(layer for layer in LAYERS if layer in names)

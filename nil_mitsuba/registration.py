@@ -16,6 +16,7 @@ VARIANT_MODULES = (
     "nil_mitsuba.interaction",
     "nil_mitsuba.camera",
     "nil_mitsuba.lights",
+    "nil_mitsuba.passes",
     "nil_mitsuba.integrator",
 )
 

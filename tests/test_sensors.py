@@ -259,13 +259,13 @@ def test_each_sensor_of_a_scene_takes_its_own_image(rgb):
 def test_passes_make_the_image_of_all_their_samples(rgb, monkeypatch):
     """A render of several passes holds as many samples as were asked for, rounded up to passes."""
     integrator = mi.load_dict(PLAIN | {"max_depth": 1})
-    import nil_mitsuba.integrator as module
+    from nil_mitsuba import passes as module
 
-    monkeypatch.setattr(module, "PASS_SAMPLES", 24 * 24 * 10)
+    monkeypatch.setattr(module, "WAVEFRONT_SAMPLES", 24 * 24 * 10)
     scene = glowing_scene(s=sensor("perspective", (0, 0, 0)))
-    counts = list(integrator.passes(scene, spp=64))
-    assert counts == [10, 20, 30, 40, 50, 60, 70]
-    image = scene.sensors()[0].film().develop()
+    passes = module.Passes(integrator, scene, spp=64)
+    assert (passes.count, passes.spp) == (7, 10)
+    image = mi.render(scene, integrator=integrator, spp=64)
     exact = photograph(glowing_scene(s=sensor("perspective", (0, 0, 0))), spp=1024)
     assert dr.max(dr.abs(image.array - exact.array))[0] <= 5 * 1.5 * (1 / 64) ** 0.5
     assert dr.mean(dr.abs(image.array - exact.array))[0] <= 0.03
