@@ -12,7 +12,7 @@ from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
 from .lights import Lights
-from .passes import LAYERS, MEAN_LAYERS, Passes, layer_channels
+from .passes import COUNT_LAYERS, LAYERS, MEAN_LAYERS, Passes, layer_channels
 from .quotient import Space, multiply_cells
 from .tracer import Cone, Tracer
 
@@ -81,8 +81,8 @@ class NilIntegrator(ADIntegrator):
         """Render an image (mi.TensorXf); Mitsuba's entry, see ``mi.render``."""
         seed = int(seed[0]) if dr.is_array_v(seed) else int(seed)
         passes = Passes(self, scene, sensor, seed, spp)
-        sums = passes.render(0)
-        for index in range(1, passes.count):
+        sums = passes.nothing()
+        for index in range(passes.count):
             sums = sums.plus(passes.render(index))
         image = passes.develop(sums)
         if not develop:
@@ -114,7 +114,8 @@ class NilIntegrator(ADIntegrator):
         scale = math.sqrt(sampler.sample_count())
         cone = Cone(cone.width * scale, cone.spread * scale)
         radiance, valid, seen = self.trace(view, sampler, ray, p, v, cone, mi.Bool(active))
-        aovs = [mi.Float(channel) for layer in self.layers for channel in seen[layer]]
+        # What is not seen in the scene is the number of samples: this one
+        aovs = [mi.Float(channel) for layer in self.layers for channel in seen.get(layer, [1])]
         return radiance, valid, aovs, None
 
     def render_forward(self, *_, **__):
@@ -184,8 +185,9 @@ class NilIntegrator(ADIntegrator):
                 # A light that emitter sampling could have drawn is shared with it
                 lit = active & ~bsdf_delta_prev & (emitter != None)  # noqa: E711
                 image = multiply_cells(home, hit.cell, space)
-                em_pdf = lights.pdf(hit, si, emitter, vertex_prev, v, image, lit)
-                Le *= dr.select(lit, mis_weight(bsdf_pdf_prev, em_pdf), 1)
+                if lit:  # few are: most packets of rays need not compute the density
+                    em_pdf = lights.pdf(hit, si, emitter, vertex_prev, v, image, lit)
+                    Le *= mis_weight(bsdf_pdf_prev, em_pdf)
             L += β * Le
 
             # Continue tracing the path at this point?
@@ -260,18 +262,16 @@ class NilIntegrator(ADIntegrator):
     def _visible(self, view, si, light, cone, active):
         """Whether nothing stands between a surface and the light drawn there."""
         space, tracer = view.space, view.tracer
-        direction, distance = light.direction, light.distance
-        start = offset(si.p, si.n, direction, space)
-        if view.lights.has_area:
-            # Aimed anew from the offset start: a light seen at a grazing angle would hide itself.
-            way = geometry.connect(start, light.target, space.twist)
-            aim = ~light.delta & (distance < dr.inf)
-            direction = dr.select(aim, mi.Vector3f(way.direction), direction)
-            distance = dr.select(aim, way.distance, distance)
+        p = space.to_cells(si.p)
+        start = offset(si.p, si.n, light.direction, space)
         if space.quotient:
-            start = geometry.wrap(start, space.twist)[0]
-        reach = dr.minimum(distance * (1 - SHADOW_EPSILON), tracer.reach(start, direction))
-        return ~tracer.occluded(start, direction, cone, reach, active, si.time)
+            start, home = geometry.wrap(start, space.twist)
+            p = geometry.multiply(mi.Point3f(geometry.inverse(home, space.integer_twist)), p,
+                                  space.twist)
+        reach = light.distance * (1 - SHADOW_EPSILON)
+        if view.lights.has_infinite:
+            reach = dr.minimum(reach, tracer.reach(start, light.direction))
+        return ~tracer.occluded(p, light.direction, cone, reach, active, si.time, start)
 
     @dr.syntax
     def _beyond_lights(self, view, time, p, v, cone, active):
@@ -328,7 +328,7 @@ class View:
         self.tracer = Tracer(scene, self.space, integrator.max_distance)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
-        self.layers = integrator.layers
+        self.layers = [layer for layer in integrator.layers if layer not in COUNT_LAYERS]
         if "shape" in self.layers:
             self._number_shapes()
 
@@ -354,9 +354,13 @@ class View:
                 albedo = bsdf.eval_diffuse_reflectance(si, first)
                 # What only reflects and refracts shows other things' colours: white, for denoisers
                 smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-                rgb = mi.spectrum_to_srgb(albedo, si.wavelengths) if mi.is_spectral else albedo
-                found[layer] = [dr.select(smooth, dr.clip(rgb[i % len(rgb)], 0, 1), 1)
-                                for i in range(3)]
+                if mi.is_spectral:
+                    # Under a light of equal energies. Single samples of a colour may be anything
+                    albedo *= dr.rcp(mi.pdf_rgb_spectrum(si.wavelengths))
+                    rgb = mi.spectrum_to_srgb(albedo, si.wavelengths)
+                else:
+                    rgb = dr.clip(albedo, 0, 1)
+                found[layer] = [dr.select(smooth, rgb[i % len(rgb)], 1) for i in range(3)]
             elif layer == "cell":
                 found[layer] = list(multiply_cells(home, hit.cell, self.space))
             elif layer == "shape":

@@ -30,19 +30,15 @@ class LightSample:
     """Light that may arrive at a vertex.
 
     ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
-    it, infinite for directional light; ``target`` (cells): the point on an area light;
-    ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
+    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
     light, which no other technique finds.
     """
 
-    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "target": mi.Point3f,
-                    "weight": mi.Spectrum, "pdf": mi.Float, "delta": mi.Bool}
+    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum, "pdf": mi.Float, "delta": mi.Bool}
 
-    def __init__(self, direction=None, distance=None, target=None, weight=None, pdf=None,
-                 delta=None):
+    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None):
         self.direction = direction
         self.distance = distance
-        self.target = target
         self.weight = weight
         self.pdf = pdf
         self.delta = delta
@@ -266,7 +262,7 @@ class Lights:
 
     def _sample_infinite(self, emitter, si, u, active):
         ds, weight = emitter.sample_direction(si, u, active)
-        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), mi.Point3f(0),
+        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf),
                            dr.select(ds.pdf > 0, weight, 0),
                            dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta))
 
@@ -303,7 +299,7 @@ class Lights:
         pdf = probability * density / (area * stretch * cosine)
         reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
         pdf = dr.select(reached, pdf, 0)
-        return LightSample(direction, way.distance, image,
+        return LightSample(direction, way.distance,
                            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False))
 
     def _sample_point(self, emitter, q, si, p, u, u1, u2, active):
@@ -339,7 +335,7 @@ class Lights:
         density = dr.abs(density) * dr.square(space.size)
         reached = active & (density > 0) & (distance <= self.max_distance) & (ds.pdf > 0)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(direction, distance, image, weight, mi.Float(0), mi.Bool(True))
+        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True))
 
     # ------------------------------------------------------------------ weights
 

@@ -14,36 +14,55 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from .camera import Camera
+from .checkpoint import joined
+from .exr import LAYERS as FILE_LAYERS
 
 # Camera samples in one wavefront: more use no processor better, and memory grows with them.
 WAVEFRONT_SAMPLES = 2**21
 
 # Layers that are averaged over a pixel as the picture is, with their channels, ...
-MEAN_LAYERS = {
-    "distance": ("depth.Z",),
-    "position": ("position.x", "position.y", "position.z"),
-    "normal": ("normal.x", "normal.y", "normal.z"),
-    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
-}
-# ... and layers of whole numbers, which no average could name: those of a pixel's first sample.
-POINT_LAYERS = {
-    "cell": ("cell.x", "cell.y", "cell.z"),
-    "shape": ("shape.X",),
-}
-LAYERS = MEAN_LAYERS | POINT_LAYERS
+MEAN_LAYERS = {layer: FILE_LAYERS[layer].channels
+               for layer in ("distance", "position", "normal", "albedo")}
+# ... layers of whole numbers, which no average could name: those of a pixel's first sample, ...
+POINT_LAYERS = {layer: FILE_LAYERS[layer].channels for layer in ("cell", "shape")}
+# ... and the number of samples in a pixel.
+COUNT_LAYERS = {"samples": FILE_LAYERS["samples"].channels}
+LAYERS = MEAN_LAYERS | POINT_LAYERS | COUNT_LAYERS
+
+LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB, as Mitsuba weighs it
 
 
 @dataclass
 class Sums:
-    """What passes add up to: ``values`` (TensorXf, height × width × channels of the film, weights
-    included) and ``points`` (TensorXi, height × width × channels of the point layers)."""
+    """What passes add up to, in double precision: 2³² samples and more lose nothing.
 
-    values: mi.TensorXf
+    ``values``: TensorXd, height × width × channels of the film, weights included; ``moments``:
+    TensorXd, 3 × height × width, sums over passes of S², S·W and W², where S is the sum of weighted
+    luminances in a pixel of one pass and W that of the weights; ``points``: TensorXi, height ×
+    width × channels of the point layers; ``passes``: ranges (first, stop) of the passes that are
+    in, sorted.
+    """
+
+    values: mi.TensorXd
+    moments: mi.TensorXd
     points: mi.TensorXi
+    passes: tuple[tuple[int, int], ...]
 
-    def plus(self, later: Sums) -> Sums:
-        """The sums of both; the point layers are those of the earlier pass."""
-        return Sums(self.values + later.values, self.points)
+    @property
+    def count(self) -> int:
+        """Number of passes that are in."""
+        return sum(stop - first for first, stop in self.passes)
+
+    def plus(self, other: Sums) -> Sums:
+        """The sums of both; point layers are those of the lowest pass.
+
+        Raises ValueError if a pass is in both.
+        """
+        passes = joined(self.passes, other.passes)
+        first = other if other.passes[:1] < self.passes[:1] or not self.passes else self
+        sums = Sums(self.values + other.values, self.moments + other.moments, first.points, passes)
+        dr.eval(sums.values, sums.moments)
+        return sums
 
 
 def layer_channels(layers, of: dict[str, tuple[str, ...]] = LAYERS) -> list[str]:
@@ -56,12 +75,12 @@ class Passes:
 
     ``spp`` is the number of samples per pixel in each pass, ``count`` the number of passes that
     hold at least the samples asked for. Both follow from the scene and the settings alone.
-    A pass holds as many samples as fit into `WAVEFRONT_SAMPLES`, but at least one per pixel; larger
-    images are rendered in bands.
+    A pass holds as many samples as fit into `WAVEFRONT_SAMPLES`, or ``pass_spp`` per pixel if that
+    is less, but at least one per pixel; larger images are rendered in bands.
     """
 
     def __init__(self, integrator, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0,
-                 spp: int = 0):
+                 spp: int = 0, pass_spp: int | None = None):
         self.integrator = integrator
         self.scene = scene
         self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -76,9 +95,11 @@ class Passes:
         self.band = math.ceil(pixels / self.bands)   # Pixels of a band
 
         wanted = spp or self.sensor.sampler().sample_count()
-        count = math.ceil(wanted / max(1, WAVEFRONT_SAMPLES // pixels))
+        fits = max(1, WAVEFRONT_SAMPLES // pixels)
+        if pass_spp is None:
+            pass_spp = math.ceil(wanted / math.ceil(wanted / fits))
         self.sampler = self.sensor.sampler().clone()
-        self.sampler.set_sample_count(math.ceil(wanted / count))
+        self.sampler.set_sample_count(min(pass_spp, fits))
         self.spp = self.sampler.sample_count()       # Some samplers round it up
         self.sampler.set_samples_per_wavefront(self.spp)
         self.count = math.ceil(wanted / self.spp)
@@ -86,6 +107,16 @@ class Passes:
         self.view = integrator.view(scene)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
         self.film.prepare(layer_channels(self.layers, MEAN_LAYERS))
+
+    def nothing(self) -> Sums:
+        """The sums of no passes."""
+        crop = self.film.crop_size()
+        depth = len(layer_channels(self.layers, POINT_LAYERS))
+        values = dr.zeros(mi.TensorXd, (crop.y, crop.x, self.film.create_block().channel_count()))
+        moments = dr.zeros(mi.TensorXd, (3, crop.y, crop.x))
+        # In memory, so that the first pass is added by the same kernel as all others
+        dr.make_opaque(values, moments)
+        return Sums(values, moments, dr.zeros(mi.TensorXi, (crop.y, crop.x, depth)), ())
 
     def render(self, index: int) -> Sums:
         """Render pass number ``index``, whose first seed is `pass_seed`."""
@@ -98,20 +129,23 @@ class Passes:
             points = dr.zeros(mi.Int32, crop.y * crop.x * depth)
             for band in range(self.bands):
                 self._render_band(block, points, index * self.bands + band, band * self.band)
-            return Sums(block.tensor(), mi.TensorXi(points, (crop.y, crop.x, depth)))
+            values = mi.TensorXd(block.tensor())
+            return Sums(values, self._moments(values), mi.TensorXi(points, (crop.y, crop.x, depth)),
+                        ((index, index + 1),))
 
     def develop(self, sums: Sums) -> mi.TensorXf:
         """The image (height × width × channels) of what passes have added up to.
 
-        The sensor's film holds the same image afterwards.
+        The sensor's film holds the same image afterwards, except for layers of whole numbers.
         """
-        film = self.film
-        film.clear()
-        film.put_block(mi.ImageBlock(sums.values, film.crop_offset()))
-        image = film.develop()
-        if sums.points.shape[2] == 0:
-            return image
-        return dr.concat([image, mi.TensorXf(sums.points)], axis=2)
+        return develop(self.film, self.layers, sums, self.spp)
+
+    def _moments(self, values):
+        total, weight = luminance(self.film, values)
+        crop = self.film.crop_size()
+        return mi.TensorXd(
+            dr.concat([dr.square(total), total * weight, dr.square(weight)]), (3, crop.y, crop.x)
+        )
 
     def _render_band(self, block, points, index, first):
         sampler = self.sampler.clone()
@@ -171,6 +205,33 @@ class Passes:
         active = inside & (number != 0xFFFFFFFF)
         for i, channel in enumerate(channels):
             dr.scatter(points, channel, number * len(channels) + i, active)
+
+
+def develop(film: mi.Film, layers: tuple[str, ...], sums: Sums, pass_spp: int) -> mi.TensorXf:
+    """The image in ``film`` of passes of ``pass_spp`` samples that rendered ``layers``, too."""
+    film.prepare(layer_channels(layers, MEAN_LAYERS))
+    film.put_block(mi.ImageBlock(mi.TensorXf(sums.values), film.crop_offset()))
+    image = film.develop()
+    shape = image.shape[:2]
+    further = [mi.TensorXf(sums.points)] if sums.points.shape[2] else []
+    if "samples" in layers:
+        further.append(dr.full(mi.TensorXf, sums.count * pass_spp, (*shape, 1)))
+    return dr.concat([image, *further], axis=2) if further else image
+
+
+def luminance(film: mi.Film, values: mi.TensorXd) -> tuple[mi.Float64, mi.Float64]:
+    """Sums of luminances and of weights by pixel, out of the channels that a film sums up."""
+    channels = values.shape[2]
+    pixel = dr.arange(mi.UInt32, values.shape[0] * values.shape[1]) * channels
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        # Bands of its own, none more important than another; the last channel is the weight
+        weight = channels - 1
+        colours = [1 / weight] * weight
+    else:
+        weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+        colours = LUMINANCE
+    total = sum(c * dr.gather(mi.Float64, values.array, pixel + i) for i, c in enumerate(colours))
+    return total, dr.gather(mi.Float64, values.array, pixel + weight)
 
 
 def pass_seed(seed: int, index: int) -> int:
