@@ -68,28 +68,71 @@ def against_path(width, spp, rounds):
               f"mean {mean:.5f} ± {error:.5f}")
 
 
+def bumpy_scene(triangles, **properties):
+    """A wavy sphere in the quotient under an even sky."""
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "nil", "max_depth": 4} | properties,
+        "sensor": {
+            "type": "perspective", "fov": 70,
+            "to_world": mi.ScalarTransform4f().look_at([0.5, 0.05, 0.6], [0.5, 1, 0.4], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 128, "height": 128},
+        },
+        "sky": {"type": "constant"},
+        "mesh": bumpy_sphere(round(math.sqrt(triangles / 2))),
+    })  # fmt: skip
+
+
 def against_triangles(sizes):
     print("\ntriangles   time per path (relative to the first)")
     first = None
     for triangles in sizes:
-        n = round(math.sqrt(triangles / 2))
-        scene = {
-            "type": "scene",
-            "integrator": {"type": "nil", "max_depth": 4},
-            "sensor": {
-                "type": "perspective", "fov": 70,
-                "to_world": mi.ScalarTransform4f().look_at([0.5, 0.05, 0.6], [0.5, 1, 0.4],
-                                                           [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 128, "height": 128},
-            },
-            "sky": {"type": "constant"},
-            "mesh": bumpy_sphere(n),
-        }  # fmt: skip
-        scene = mi.load_dict(scene)
+        scene = bumpy_scene(triangles)
         seconds(scene, 32, 0)
         t = min(seconds(scene, 32, seed)[0] for seed in (1, 2, 3))
         first = first or t
-        print(f"{2 * n * n:9,}   {t / first:.2f}", flush=True)
+        print(f"{triangles:9,}   {t / first:.2f}", flush=True)
+
+
+def against_straight(triangles, spp, rounds):
+    """What bending costs in the quotient: renders at twist 1 over renders at twist 0.
+
+    Rays end elsewhere at twist 1, so that times are compared over the length that was traced.
+    """
+    print(f"\nquotient, {triangles:,} triangles: time per traced length, twist 1 : twist 0")
+    for depth in (2, 4, 8):
+        scenes = {twist: bumpy_scene(triangles, twist=twist, max_depth=depth) for twist in (0, 1)}
+        lengths = {twist: traced_length(scene) for twist, scene in scenes.items()}
+        ratios = []
+        for seed in range(rounds + 1):
+            cost = {t: seconds(scene, spp, seed)[0] / lengths[t] for t, scene in scenes.items()}
+            ratios.append(cost[1] / cost[0])
+        middle = sorted(ratios[1:])[rounds // 2]  # the first one compiles
+        print(f"max_depth {depth}   {middle:.2f}   mean length of a ray at twist 1: "
+              f"{lengths[1]:.2f} cells", flush=True)
+
+
+def traced_length(scene):
+    """Mean length (cells) of the rays between vertices in a render of one sample per pixel."""
+    from nil_mitsuba.tracer import Tracer
+
+    intersect = Tracer.intersect
+    sums = dr.zeros(mi.Float, 2)
+
+    def counted(tracer, p, v, cone, reach, active, time=0):
+        hit = intersect(tracer, p, v, cone, reach, active, time)
+        length = dr.minimum(hit.distance, reach)
+        for i, value in enumerate((length, mi.Float(1))):
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, value, mi.UInt32(i), active)
+        return hit
+
+    Tracer.intersect = counted
+    try:
+        mi.render(scene, spp=1)
+        dr.eval(sums)
+    finally:
+        Tracer.intersect = intersect
+    return sums[0] / sums[1]
 
 
 def bumpy_sphere(n):
@@ -135,7 +178,9 @@ if __name__ == "__main__":
         memory()
         against_path(32, 16, 2)
         against_triangles((1_000, 10_000))
+        against_straight(1_000, 4, 2)
     else:
         memory()
         against_path(128, 256, 5)
         against_triangles((1_000, 10_000, 100_000, 1_000_000))
+        against_straight(240_000, 32, 5)
