@@ -13,7 +13,7 @@ from .camera import Camera
 from .interaction import offset, surface_interaction
 from .lights import Lights
 from .passes import COUNT_LAYERS, LAYERS, MEAN_LAYERS, Passes, layer_channels
-from .quotient import Space, multiply_cells
+from .quotient import Space, multiply_cells, shape_box
 from .tracer import Cone, Tracer
 
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
@@ -24,8 +24,9 @@ ROUGH_SPREAD = 0.8
 SOFT_LOBE = 0.1
 
 
-# Mitsuba's math::ShadowEpsilon: a shadow ray ends this part of its length before the light.
-SHADOW_EPSILON = 10 * 1500 * 2**-24
+# A shadow ray ends this part of its length before the light. Mitsuba's own part is ten times as
+# large, which lets light through walls that it is close behind.
+SHADOW_EPSILON = 1500 * 2**-24
 
 
 class NilIntegrator(ADIntegrator):
@@ -307,7 +308,7 @@ def _warn_of_what_is_ignored(scene, integrator):
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
     for shape in scene.shapes():
         name = f'"{shape.id() or shape.class_name()}"'
-        box = shape.bbox()
+        box = shape_box(shape)
         reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
         if integrator.quotient and reach > margin:
             mi.Log(mi.LogLevel.Warn,

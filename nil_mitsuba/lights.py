@@ -30,11 +30,12 @@ class LightSample:
     """Light that may arrive at a vertex.
 
     ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
-    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
-    light, which no other technique finds.
+    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with
+    respect to solid angle, 0 for ``delta`` light, which no other technique finds.
     """
 
-    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum, "pdf": mi.Float, "delta": mi.Bool}
+    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum,
+                    "pdf": mi.Float, "delta": mi.Bool}
 
     def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None):
         self.direction = direction

@@ -17,6 +17,24 @@ def opaque(value):
     return value
 
 
+def shape_box(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
+    """Bounding box (scene units) of a shape.
+
+    Mitsuba 3.9.1 merges meshes while it loads a scene, and keeps the box of some of them only.
+    """
+    if shape.is_mesh():
+        shape.recompute_bbox()
+    return shape.bbox()
+
+
+def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
+    """Bounding box (scene units) of all shapes; not valid if there are none."""
+    box = mi.ScalarBoundingBox3f()
+    for shape in scene.shapes():
+        box.expand(shape_box(shape))
+    return box
+
+
 class Space:
     """The scene's Nil space: twist, quotient or not, and the cube's place in the scene.
 

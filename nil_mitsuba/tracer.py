@@ -14,13 +14,16 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
-from .quotient import Space, exit_through_face, opaque, through_face
+from .quotient import Space, exit_through_face, opaque, scene_box, through_face
 
 # A chord's sagitta is at most this part of the cone's width there: along rays that are seen, behind
 # rough bounces, and towards lights. What a chord has missed cannot be found again, while what it
 # has met by mistake can, so the error is one-sided: an image's mean allows less than its edges do.
 # On the bent Cornell box each of the three moves the mean by less than 0.15 %.
-SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.25, 0.15, 0.2
+SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.12, 0.15, 0.2
+# Rays that are seen are allowed at their start what they are at this distance (cells): of the many
+# short chords there few meet anything. Beyond a fifteenth of a cell that is within the tolerance.
+START = 0.4
 
 
 class Cone:
@@ -102,25 +105,26 @@ class Chords:
     """Lengths (cells) of chords whose sagitta keeps within ``part`` of the cone at their middle.
 
     The sagitta is at most h² g/8 with g = ``bend.across``, and h² g/8 = width + spread (t + h/2)
-    is solved for h.
+    is solved for h, the cone being as wide at its start as elsewhere at the distance ``start``.
+    Below ``least`` sagittas are lost in float32's rounding.
     """
 
-    def __init__(self, bend: Bend, cone: Cone, part: mi.Float):
-        self.spread, self.width = part * cone.spread, part * cone.width
-        self.across, self.longest = bend.across, bend.longest
+    def __init__(self, bend: Bend, cone: Cone, part: mi.Float, start: mi.Float, least: mi.Float):
+        self.spread = part * cone.spread
+        self.width = dr.fma(self.spread, start, part * cone.width)
+        self.across, self.least, self.longest = bend.across, least, bend.longest
         self.scale = 2 * dr.rcp(bend.across)
 
     def after(self, t: mi.Float) -> mi.Float:
         """The chord that starts at arc length ``t``."""
         root = self._root(dr.fma(self.spread, t, self.width))
-        # Below 1e-4 cells a sagitta is lost in float32's rounding.
-        return dr.clip(self.scale * (self.spread + root), 1e-4, self.longest)
+        return dr.clip(self.scale * (self.spread + root), self.least, self.longest)
 
     def between(self, t: mi.Float, remaining: mi.Float) -> mi.Float:
         """The chord that starts at ``t`` if the cone narrows again towards ``remaining``."""
         room = dr.fma(self.spread, remaining, self.width)
         towards = 4 * room / dr.maximum(self._root(room) + self.spread, 1e-20)
-        return dr.maximum(dr.minimum(self.after(t), towards), 1e-4)
+        return dr.maximum(dr.minimum(self.after(t), towards), self.least)
 
     def _root(self, room: mi.Float) -> mi.Float:
         return dr.sqrt(dr.fma(2 * self.across, room, dr.square(self.spread)))
@@ -133,7 +137,9 @@ class Tracer:
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
-        box = scene.bbox()
+        # 1e-4 cells near the origin: a hundred times what Mitsuba's float32 arithmetic may lose
+        self.least = opaque(100 * space.slack)
+        box = scene_box(scene)
         if not box.valid():  # a scene of environment emitters only
             box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
         self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
@@ -202,7 +208,8 @@ class Tracer:
         quotient = space.quotient
         turn = k * v.z
         bend = Bend(v, k)
-        chords = Chords(bend, cone, dr.select(cone.soft, SOFT_SAGITTA, SAGITTA))
+        chords = Chords(bend, cone, dr.select(cone.soft, SOFT_SAGITTA, SAGITTA),
+                        dr.select(cone.soft, 0, START), self.least)
         # Where chords join differs from ray to ray, which turns their error into noise.
         stretch = dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3)
 
@@ -230,7 +237,8 @@ class Tracer:
             there = mi.Bool(False)
             while searching:
                 fresh = redo | (t0 >= t1)
-                h = dr.minimum(stretch * chords.after(t0), cap)
+                # At least a few roundings of the length, so that every chord moves on
+                h = dr.maximum(dr.minimum(stretch * chords.after(t0), cap), 2**-21 * t0)
                 wanted = mi.Float(h)
                 empty = mi.Bool(False)
                 if not quotient:
@@ -287,8 +295,9 @@ class Tracer:
             # A step sideways has no sagitta, but its start was off the geodesic.
             sideways = length == 0
             error = dr.select(sideways, dr.inf, bend.across * 0.125 * dr.square(scale))
-            goal = dr.fma(0.004, dr.fma(cone.spread, distance, cone.width), 4e-6)
-            looking = there & ~cone.soft & (error > goal)
+            goal = dr.fma(0.004, dr.fma(cone.spread, distance, cone.width), 4 * space.slack)
+            # A chord that cannot be cut any more is taken as it is.
+            looking = there & ~cone.soft & (error > goal) & (sideways | (scale > self.least))
             # What a step sideways has met stays where the tangent there finds nothing better.
             valid = there & (~looking | sideways)
             at = mi.Float(distance)
@@ -359,14 +368,14 @@ class Tracer:
         t0, t1 = mi.Float(0), mi.Float(0)
         direction = mi.Vector3f(v)
         bend = Bend(v, k)
-        chords = Chords(bend, cone, SHADOW_SAGITTA)
+        chords = Chords(bend, cone, SHADOW_SAGITTA, 0, self.least)
         blocked = mi.Bool(False)
         active = active & (reach > 0)
         stretch = dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3)
 
         while active:
             fresh = t0 >= t1
-            h = stretch * chords.between(t0, reach - t0)
+            h = dr.maximum(stretch * chords.between(t0, reach - t0), 2**-21 * t0)
             empty = mi.Bool(False)
             if not quotient:
                 skip = self.outside(vertex, direction, bend)
