@@ -14,4 +14,13 @@ from . import geometry, registration  # noqa: E402
 
 registration.install()
 
-__all__ = ["geometry", "__version__"]
+__all__ = ["geometry", "render", "__version__"]
+
+
+def __getattr__(name):
+    # Late, since nothing else needs what stills are made with.
+    if name == "render":
+        from .stills import render
+
+        return render
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import importlib.util
 import re
 import shlex
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import click
+import drjit as dr
+import mitsuba as mi
 
-from . import __version__
+from . import __version__, checkpoint, exr, stills
+from .output import GUIDES, Output, metadata_of, software
+from .registration import refusal
+from .scene_files import Job, SceneFiles, fitted_cell
 
-# The options that a scene's own integrator shares with "nil": they survive its replacement.
-SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
-
-# Attributes of the integrator that a picture's metadata tell.
-RECORDED = (
-    "twist", "quotient", "cell_size", "tolerance", "max_distance",
-    "max_depth", "rr_depth", "hide_emitters",
-)  # fmt: skip
-
-FIT_MARGIN = 1e-3  # of the scene's largest extent: keeps walls clear of the cube's faces
+SUMS = ".sums"  # suffix of checkpoints and parts
 
 
 class Assignment(click.ParamType):
@@ -39,10 +36,67 @@ class Assignment(click.ParamType):
         return key, text
 
 
+class Duration(click.ParamType):
+    """Seconds, from a text such as ``90``, ``30m`` or ``1h30m``."""
+
+    name = "time"
+    UNITS = {"h": 3600, "m": 60, "s": 1}
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, float):
+            return value
+        number = r"(\d+\.?\d*|\.\d+)"
+        match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s?)?", value.strip())
+        seconds = match and sum(
+            float(text) * unit for text, unit in zip(match.groups(), self.UNITS.values()) if text
+        )
+        if not seconds:
+            self.fail(f'expected a time such as 90s, 30m or 1h30m, and "{value}" is none.', param,
+                      ctx)
+        return seconds
+
+
+class PassRange(click.ParamType):
+    """``a:b`` as a pair of whole numbers."""
+
+    name = "a:b"
+
+    def convert(self, value, param, ctx):
+        match = re.fullmatch(r"(\d+):(\d+)", value)
+        if not match or int(match[1]) >= int(match[2]):
+            self.fail(f'expected a:b with a < b, such as 0:8, and "{value}" is not.', param, ctx)
+        return int(match[1]), int(match[2])
+
+
+class Stopped(click.ClickException):
+    """A signal ended the command; the status says which."""
+
+    def __init__(self, sentence: str, number: int):
+        super().__init__(sentence)
+        self.exit_code = 128 + number
+
+
 @click.group()
 @click.version_option(__version__, message="%(prog)s %(version)s")
 def cli():
     """Render Mitsuba scenes in Nil geometry."""
+
+
+def picture_options(command):
+    """The options on how a picture is written."""
+    for option in reversed((
+        click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too."),
+        click.option("--exposure", type=click.FloatRange(-100, 100), default=0.0,
+                     metavar="STOPS", help="Brighten the PNG picture by so many stops."),
+        click.option("--filmic", is_flag=True,
+                     help="Let the PNG picture's highlights fade out as film does."),
+        click.option("--denoise", is_flag=True,
+                     help="Remove noise; the noisy picture stays as a layer."),
+        click.option("--compression", type=click.Choice(list(exr.COMPRESSIONS)), default="zip",
+                     show_default=True, help="Of the EXR file; dwaa and dwab are lossy."),
+    )):  # fmt: skip
+        command = option(command)
+    return command
 
 
 @cli.command()
@@ -50,9 +104,22 @@ def cli():
 @click.option(
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
 )
-@click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too.")
-@click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's]")
+@picture_options
+@click.option("--layers", metavar="A,B,…", help="Layers beside the picture: distance, position, "
+              "normal, albedo, cell, shape, samples.")
+@click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's, "
+              "or with --time or --noise no limit]")
+@click.option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
+@click.option("--noise", type=click.FloatRange(0, min_open=True), metavar="ERROR",
+              help="Stop at this relative error, such as 0.02.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option("--checkpoint", metavar="FILE" + SUMS, help="Keep the samples in this file, when the "
+              "picture is done, too.  [default: one beside the picture until it is done]")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint, if there is one.")
+@click.option("--passes", type=PassRange(), help='Render these passes only, into a file for '
+              '"nil-mitsuba merge".')
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
+@click.option("--workers", type=click.IntRange(1), help="Render in so many processes.")
 @click.option("-m", "--mode", metavar="VARIANT", default="llvm_ad_rgb", show_default=True)
 @click.option(
     "-D", "--define", type=Assignment(), multiple=True,
@@ -62,68 +129,150 @@ def cli():
     "-s", "--sensor", metavar="INDEX", type=click.IntRange(0), default=0, show_default=True,
     help="Sensor to render with, in the scene's order.",
 )  # fmt: skip
-@click.option("-t", "--threads", type=click.IntRange(1), help="Threads to render with.")
+@click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress bar, no notes.")
 @click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
 @click.option(
     "-P", "--property", "properties", metavar="NAME=VALUE", type=Assignment(), multiple=True,
     help='Set a property of the integrator "nil", such as twist=0 or cell_origin=-1,-1,-1.',
 )  # fmt: skip
 @click.option("--fit", is_flag=True, help="Fit the cell to the scene's bounding box.")
-def render(scene, output, png, spp, seed, mode, define, sensor, threads, verbose, properties, fit):
+def render(scene, define, properties, layers, fit, sensor, mode, threads, verbose, **options):
     """Render a scene with the integrator "nil", whatever integrator it names.
 
-    The letters are those of Mitsuba's own command.
+    The letters are those of Mitsuba's own command. Ctrl-C and SIGTERM finish the pass that is being
+    rendered, save the samples and write the picture so far.
     """
     scene_path = Path(scene)
     if not scene_path.is_file():
         what = "is not a file" if scene_path.exists() else "does not exist"
         raise click.ClickException(f'the scene "{scene}" {what}.')
-    exr_path = _output_path(output or scene_path.with_suffix(".exr"), ".exr", "-o")
-    png_path = _output_path(png, ".png", "--png") if png else None
+    paths = _paths(scene_path, options)
+    try:
+        rules = stills.check_rules(options["spp"], options["seconds"], options["noise"])
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    note = _silence if options["quiet"] else _note
+    job = None
+    if options["scheduler"] or options["workers"]:
+        if options["scheduler"] and options["workers"]:
+            raise click.UsageError("--workers starts a cluster here, --scheduler names another.")
+        from . import cluster  # noqa: F401 - says what it needs before anything is rendered
 
-    mi, dr = _mitsuba(mode, verbose)
+        # Its properties, hash and samples per pass are known later
+        job = Job(str(scene_path.absolute()), mode, dict(define), {}, sensor, options["seed"],
+                  rules.spp, box_filter=options["denoise"])
+    options["worker_threads"] = threads
+
+    _set_variant(mode, verbose)
+    if options["denoise"]:
+        _require_denoiser()
     # Mitsuba 3.9 waits for ever for an EXR texture if there is no worker thread to read it.
     threads = threads or dr.thread_count()
     dr.set_thread_count(max(threads, 2))
-    mi.set_file_resolver(_resolver(mi, scene_path.parent))
-    files = SceneFiles(mi, str(scene_path), dict(define), dict(properties))
+    mi.set_file_resolver(_resolver(scene_path.parent))
+    properties = dict(properties)
+    if layers is not None:
+        properties["aovs"] = layers
+    files = SceneFiles(str(scene_path), dict(define), properties)
+    if options["denoise"]:
+        files.use_box_filter()
+    for sentence in files.notes:
+        note(sentence)
 
-    # Without --fit the integrator's parameters are checked before large meshes are loaded.
-    integrator = None if fit else files.integrator()
-    mi_scene = files.scene()
+    # The integrator's parameters are checked before large meshes are loaded.
+    integrator = files.integrator()
+    scene_hash = files.hash
+    layers = getattr(integrator, "layers", ())
+    # Merged meshes have no numbers of their own
+    mi_scene = files.scene(merge="shape" not in layers)
+    further = {}
     if fit:
-        integrator = files.integrator(**_fitted_cell(mi_scene.bbox()))
-    if not mi_scene.sensors():
+        further |= fitted_cell(mi_scene)
+        note("--fit: " + " ".join(f"{name}={value}" for name, value in further.items()))
+    if options["denoise"]:
+        further["aovs"] = ",".join({*layers, *GUIDES})
+    if further:
+        integrator = files.integrator(**further)
+    sensors = mi_scene.sensors()
+    if not sensors:
         raise click.ClickException(f'the scene "{scene}" has no sensor.')
-    if sensor >= len(mi_scene.sensors()):
+    if sensor >= len(sensors):
         raise click.ClickException(
             f'the scene "{scene}" has no sensor {sensor}: its sensors are numbered from 0 to '
-            f"{len(mi_scene.sensors()) - 1}."
+            f"{len(sensors) - 1}."
         )
-
+    about = {
+        "scene": scene,
+        "integrator": str(integrator),
+        "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
+    }
     dr.set_thread_count(threads)
-    start = time.perf_counter()
-    spp = _render(integrator, mi_scene, sensor, seed, spp)
-    seconds = time.perf_counter() - start
+    if hasattr(integrator, "view"):
+        still = _still(mi_scene, integrator, sensor, scene_hash, rules, paths["sums"], note,
+                       options)
+        if job:
+            job = replace(job, properties=properties | further, pass_spp=still.passes.spp,
+                          scene_hash=scene_hash)
+        _render_still(still, about, layers, paths, options, job)
+    else:
+        _render_in_one_go(mi_scene, integrator, sensor, scene_hash, about, paths, options)
 
-    film = mi_scene.sensors()[sensor].film()
-    with contextlib.ExitStack() as stack:
-        # Both files are complete before either takes its place.
-        exr_part = stack.enter_context(_replacing(exr_path))
-        png_part = stack.enter_context(_replacing(png_path)) if png_path else None
-        if png_part:
-            _write_png(film, png_part)
-        from . import exr
 
-        exr.write_film(exr_part, film, _metadata(mi, scene, integrator, spp, seed, seconds))
+@cli.command()
+@click.argument("parts", metavar="PARTS...", nargs=-1, required=True)
+@click.option("-o", "--output", metavar="OUT.exr", required=True,
+              help=f"With the suffix {SUMS}, the parts in one file.")
+@picture_options
+def merge(parts, output, **options):
+    """Join parts that "nil-mitsuba render --passes" has rendered, to a picture."""
+    sums_only = Path(output).suffix == SUMS
+    if sums_only and (options["png"] or options["denoise"]):
+        raise click.UsageError(f"--png and --denoise go with a picture, not with {SUMS}.")
+    exr_path = _output_path(output, SUMS if sums_only else ".exr", "-o")
+    png_path = _output_path(options["png"], ".png", "--png") if options["png"] else None
+
+    _set_variant(checkpoint.peek(parts[0])["variant"], 0)
+    state = checkpoint.load(parts[0])
+    for part in parts[1:]:
+        try:
+            state = state.plus(checkpoint.load(part))
+        except ValueError as error:
+            raise click.ClickException(
+                f'cannot merge "{part}" with "{parts[0]}": {error}'
+            ) from None
+    missing = stills.missing(state)
+    if missing:
+        _note(f"the passes {checkpoint.name_passes(missing)} of 0:{state.about['count']} are "
+              "missing.")
+    state.about["commandLine"] = shlex.join(["nil-mitsuba", *sys.argv[1:]])
+    if sums_only:
+        checkpoint.save(exr_path, state)
+    else:
+        if options["denoise"]:
+            _require_denoiser()
+            _require_guides(state.settings)
+        layers = tuple(state.settings["layers"])
+        out = _output({"exr": exr_path, "png": png_path}, options, layers)
+        out.write(stills.picture_of(state), metadata_of(state))
     for path in filter(None, (exr_path, png_path)):
         click.echo(path)
+
+
+@cli.command()
+@click.argument("file", metavar="FILE.exr")
+def info(file):
+    """Print what a picture holds, and how it was rendered."""
+    if Path(file).suffix == SUMS:
+        click.echo(checkpoint.describe(file))
+    else:
+        click.echo(exr.describe(file))
 
 
 def main() -> None:
     """Run the command: one sentence on stderr and a status other than 0 if it cannot be done.
 
-    The status is 2 for a wrong command line, 130 after Ctrl-C and 1 otherwise.
+    The status is 2 for a wrong command line, 130 after Ctrl-C, 143 after SIGTERM and 1 otherwise.
     """
     verbose = 0
     try:
@@ -134,7 +283,7 @@ def main() -> None:
     except click.ClickException as error:
         sentence, status = error.format_message(), error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        sentence, status = "interrupted, nothing was written.", 130
+        sentence, status = "interrupted, no picture was written.", 130
     except Exception as error:
         verbose = sum(arg.count("v") for arg in sys.argv if re.fullmatch("-v+", arg))
         if verbose > 1:
@@ -153,171 +302,196 @@ def tidy(text: str) -> str:
     return re.sub(r"^(?:Error while loading|While loading|At) (?=.+? \(line )", "", text)
 
 
-# ------------------------------------------------------------------------ scene
-
-
-class SceneFiles:
-    """A scene description that has been read, with "nil" in the place of another integrator."""
-
-    def __init__(self, mi, path: str, parameters: dict[str, str], properties: dict[str, str]):
-        self.mi = mi
-        self.config = mi.parser.ParserConfig(mi.variant())
-        for name in ("config", "filename"):
-            if name in parameters:  # the names of the parser's own arguments
-                raise click.ClickException(f'-D cannot define "{name}": rename the parameter.')
-        state = mi.parser.parse_file(self.config, path, **parameters)
-        if state.root.type != mi.ObjectType.Scene:
-            raise click.ClickException(f'the root element of "{path}" must be a <scene> tag.')
-        mi.parser.transform_upgrade(self.config, state)
-        mi.parser.transform_resolve(self.config, state)
-
-        # Two scenes: one without the integrator, one with nothing else.
-        self.rest, self.alone = state, mi.parser.ParserState(state)
-        reference = self._take_integrator(path)
-        self.alone.root.props = mi.Properties("scene")
-        self.alone.root.props["integrator"] = reference
-        self._nil = self._find_nil(reference.index()) or self._replace(reference.index(), path)
-        for name, text in properties.items():
-            self._nil.props[name] = parse_value(mi, text)
-
-    def integrator(self, **properties):
-        """The integrator by itself, with further properties of "nil" set."""
-        for name, value in properties.items():
-            self._nil.props[name] = value
-        return self.mi.parser.instantiate(self.config, self.alone).integrator()
-
-    def scene(self):
-        """The scene without its integrator."""
-        self.mi.parser.transform_merge_equivalent(self.config, self.rest)
-        self.mi.parser.transform_merge_meshes(self.config, self.rest)
-        return self.mi.parser.instantiate(self.config, self.rest)
-
-    def _take_integrator(self, path: str):
-        """Take the integrator out of the scene; a reference to its node among `alone`'s."""
-        mi, nodes, root = self.mi, self.alone.nodes, self.rest.root.props
-        own = [
-            key
-            for key, index in self._children(root)
-            if nodes[index].type == mi.ObjectType.Integrator
-        ]
-        if len(own) > 1:
-            raise click.ClickException(f'"{path}": only one integrator can be specified per scene.')
-        if own:
-            reference = root[own[0]]
-            del root[own[0]]
-            return reference
-
-        click.echo(f'{path} has no integrator: rendering with "nil".', err=True)
-        node = mi.parser.SceneNode()
-        node.type = mi.ObjectType.Integrator
-        node.props = mi.Properties("nil")
-        nodes.append(node)
-        return mi.Properties.ResolvedReference(len(nodes) - 1)
-
-    def _find_nil(self, index: int):
-        """The node of "nil" at or below an integrator's node: wrappers hold others."""
-        node = self.alone.nodes[index]
-        if node.props.plugin_name() == "nil":
-            return node
-        for _, child in self._children(node.props):
-            found = self._find_nil(child)
-            if found is not None:
-                return found
-        return None
-
-    def _replace(self, index: int, path: str):
-        node, props = self.alone.nodes[index], self.mi.Properties("nil")
-        for name in SHARED_PROPERTIES:
-            if name in node.props:
-                props[name] = node.props[name]
-        name = node.props.plugin_name()
-        click.echo(f'{path}: the integrator "{name}" is replaced by "nil".', err=True)
-        node.props = props
-        return node
-
-    def _children(self, props) -> list[tuple[str, int]]:
-        """Names and node numbers of the objects below a node."""
-        values = ((key, props[key]) for key in props.keys())
-        return [
-            (key, value.index())
-            for key, value in values
-            if isinstance(value, self.mi.Properties.ResolvedReference)
-        ]
-
-
-def parse_value(mi, text: str):
-    """The value of a property from the command line: boolean, number, vector "x,y,z" or string."""
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    for number in (int, float):
-        with contextlib.suppress(ValueError):
-            return number(text)
-    with contextlib.suppress(ValueError):
-        x, y, z = map(float, text.split(","))
-        return mi.ScalarVector3d(x, y, z)
-    return text
-
-
-def _fitted_cell(bbox) -> dict:
-    if not bbox.valid() or max(bbox.extents()) == 0:
-        raise click.ClickException("--fit needs a scene with shapes of some extent.")
-    size = max(bbox.extents()) * (1 + FIT_MARGIN)
-    origin = bbox.center() - size / 2
-    corner = ",".join(f"{c:.9g}" for c in origin)  # 9 digits give a float32 back
-    click.echo(f"--fit: cell_origin={corner} cell_size={size:.9g}", err=True)
-    return {"cell_origin": origin, "cell_size": size}
-
-
 # -------------------------------------------------------------------- rendering
 
 
-def _mitsuba(variant: str, verbose: int):
-    """Mitsuba, with `variant` set if that can run "nil", and Dr.Jit."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from .registration import refusal
-
-    mi.set_log_level(
-        (mi.LogLevel.Warn, mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[min(verbose, 3)]
-    )
-    if variant in mi.variants():
-        sentence = refusal(variant)
-        if sentence:
-            raise click.ClickException(sentence)
-    mi.set_variant(variant)
-    return mi, dr
-
-
-def _resolver(mi, folder: Path):
-    resolver = mi.FileResolver(mi.file_resolver())
-    resolver.prepend(str(folder))
-    return resolver
+def _still(scene, integrator, sensor, scene_hash, rules, sums_path, note, options):
+    if options["resume"] and not sums_path.exists():
+        note(f'there is no checkpoint "{sums_path}": beginning with the first pass.')
+    still = stills.Still(scene, sensor, integrator, options["seed"], rules,
+                         stills.pass_spp_of(sums_path, options["resume"]), scene_hash)
+    if options["denoise"]:
+        _require_guides(still.settings)
+    if options["passes"]:
+        first, stop = options["passes"]
+        if stop > still.count:
+            raise click.ClickException(
+                f"there are no passes {first}:{stop}: the picture consists of the passes "
+                f"0:{still.count}, with {still.passes.spp} samples per pixel each."
+            )
+    return still
 
 
-def _render(integrator, scene, sensor: int, seed: int, spp: int | None) -> int:
-    """Fill the sensor's film, with a progress bar if stderr is a terminal; samples per pixel."""
-    if not hasattr(integrator, "view"):  # a wrapper of Mitsuba's renders in one go
-        integrator.render(scene, sensor, seed=seed, spp=spp or 0, develop=False)
-        return spp or scene.sensors()[sensor].sampler().sample_count()
+def _render_still(still: stills.Still, about: dict, layers, paths: dict, options: dict,
+                  job: Job | None) -> None:
+    """Render in passes, until all are done, a rule is met or a signal comes; write the files.
 
-    from tqdm import tqdm
+    A job goes to a cluster.
+    """
+    sums_path, count = paths["sums"], still.count
+    first, stop = options["passes"] or (0, count)
+    if options["passes"]:
+        still.rules = stills.Rules(spp=(stop - first) * still.passes.spp)
+    state = still.start(sums_path, options["resume"])
+    state.about = about | ({"count": count} if count else {})
 
-    from .passes import Passes
+    parts = (still.render(index) for index in still.todo(state, first, stop))
+    if job:
+        from . import cluster
 
-    passes = Passes(integrator, scene, sensor, seed, spp or 0)
-    form = "{percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} samples per pixel, {remaining} left"
-    with tqdm(total=passes.count * passes.spp, bar_format=form, disable=None) as progress:
-        sums = passes.render(0)
-        progress.update(passes.spp)
-        for index in range(1, passes.count):
-            sums = sums.plus(passes.render(index))
-            progress.update(passes.spp)
-    passes.develop(sums)
-    return passes.count * passes.spp
+        parts = cluster.render(still, job, still.todo(state, first, stop), options["scheduler"],
+                               options["workers"], options["worker_threads"],
+                               lambda sentence: _note(tidy(sentence)))
+    saver = stills.Saver(sums_path, _note)
+    with contextlib.closing(parts), _Bar(still, options["quiet"]) as bar:
+        state, number = still.accumulate(state, parts, bar, saver)
+    if not state.sums.count:
+        raise Stopped("interrupted before the first pass, nothing was written.", number)
+
+    kept = False
+    if number or options["checkpoint"] or options["passes"]:
+        kept = saver.save(state)
+    if options["passes"]:
+        written = [sums_path] if kept else []
+    else:
+        written = list(filter(None, (paths["exr"], paths["png"])))
+        try:
+            _output(paths, options, layers).write(
+                stills.picture_of(state, still.film), metadata_of(state)
+            )
+        except OSError as error:
+            if not (kept or saver.save(state)):
+                raise
+            raise click.ClickException(
+                f'{error} The samples are in "{sums_path}": the same command with --resume writes '
+                "the picture."
+            ) from None
+    for path in written:
+        click.echo(path)
+    if number:
+        there = f'the same command with --resume goes on from "{sums_path}"'
+        raise Stopped(
+            f"interrupted at {state.sums.count * still.passes.spp} samples per pixel; "
+            f"{there if kept else 'the samples could not be saved'}.",
+            number,
+        )
+    if options["passes"] and not kept:
+        sys.exit(1)  # the saver has said why
+    if not (options["checkpoint"] or options["passes"]):
+        sums_path.unlink(missing_ok=True)
+
+
+def _render_in_one_go(scene, integrator, sensor, scene_hash, about, paths, options) -> None:
+    """Render with a wrapper of Mitsuba's around "nil", which knows no passes."""
+    given = [name for name in ("noise", "time", "resume", "passes", "checkpoint", "denoise",
+                               "scheduler", "workers")
+             if options["seconds" if name == "time" else name]]
+    if given:
+        raise click.ClickException(
+            f"--{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
+        )
+    film = scene.sensors()[sensor].film()
+    start = time.perf_counter()
+    image = integrator.render(scene, sensor, seed=options["seed"], spp=options["spp"] or 0)
+    dr.eval(image)
+    dr.sync_thread()
+    spp = options["spp"] or scene.sensors()[sensor].sampler().sample_count()
+    metadata = about | {
+        "sceneHash": scene_hash, "spp": spp, "seed": options["seed"], "sensor": sensor,
+        "renderTime": time.perf_counter() - start, "variant": mi.variant(),
+        "software": software(stills.versions()),
+    }
+    names = [field.name for field in film.bitmap().struct_()]
+    picture = stills.Picture(names, image, {}, exr.component_format(film))
+    _output(paths, options, ()).write(picture, metadata)
+    for path in filter(None, (paths["exr"], paths["png"])):
+        click.echo(path)
+
+
+class _Bar:
+    """A progress bar on stderr, if that is a terminal: called with each ``stills.Progress``."""
+
+    FORM = "{percentage:3.0f}% |{bar}| {postfix}"
+
+    def __init__(self, still: stills.Still, quiet: bool):
+        from tqdm import tqdm
+
+        self.pixels = float(dr.prod(still.film.crop_size()))
+        self.bar = tqdm(total=1.0, bar_format=self.FORM, disable=quiet or None, leave=False)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.bar.close()
+
+    def __call__(self, progress: stills.Progress) -> None:
+        if self.bar.disable:
+            return
+        left = progress.left
+        spp = progress.rules.spp
+        words = [f"{progress.samples}{f'/{spp}' if spp else ''} samples per pixel"]
+        if progress.samples:
+            words.append(f"{progress.samples * self.pixels / progress.seconds / 1e6:.2f} M/s")
+        words.append(f"{self._clock(progress.seconds)} elapsed")
+        if left is not None:
+            words.append(f"{self._clock(left)} left")
+        if progress.noise is not None:
+            words.append(f"noise {progress.noise:.2g}")
+        whole = progress.seconds + left if left is not None else 0
+        self.bar.n = min(1.0, progress.seconds / whole) if whole else 0.0
+        self.bar.set_postfix_str(", ".join(words), refresh=True)
+
+    def _clock(self, seconds: float) -> str:
+        return self.bar.format_interval(seconds)
 
 
 # ----------------------------------------------------------------------- output
+
+
+def _paths(scene: Path, options: dict) -> dict[str, Path | None]:
+    """The files to write: "exr", "png" and "sums"."""
+    output, passes = options["output"], options["passes"]
+    if passes:
+        for name in ("png", "denoise", "checkpoint", "noise", "seconds"):
+            if options[name]:
+                raise click.UsageError(
+                    "--passes renders a part of --spp samples: it goes with none of --png, "
+                    "--denoise, --checkpoint, --noise and --time."
+                )
+        part = output or scene.with_suffix(f".{passes[0]}-{passes[1]}{SUMS}")
+        return {"exr": None, "png": None, "sums": _output_path(part, SUMS, "--passes")}
+    exr_path = _output_path(output or scene.with_suffix(".exr"), ".exr", "-o")
+    sums = options["checkpoint"] or exr_path.with_suffix(SUMS)
+    return {
+        "exr": exr_path,
+        "png": _output_path(options["png"], ".png", "--png") if options["png"] else None,
+        "sums": _output_path(sums, SUMS, "--checkpoint"),
+    }
+
+
+def _output(paths: dict, options: dict, layers: tuple[str, ...]) -> Output:
+    return Output(paths["exr"], paths["png"], options["exposure"], options["filmic"],
+                  options["compression"], options["denoise"], layers)
+
+
+def _require_denoiser() -> None:
+    if importlib.util.find_spec("mitsuba_oidn") is None:
+        raise click.ClickException(
+            "--denoise needs the package mitsuba-oidn: pip install 'nil-mitsuba[denoise]'"
+        )
+
+
+def _require_guides(settings: dict) -> None:
+    """Refuse what cannot be denoised."""
+    film = settings["film"]
+    if film["pixel_format"] not in ("rgb", "rgba"):
+        raise click.ClickException('--denoise needs a film with the pixel format "rgb" or "rgba".')
+    if not film["filter"].startswith("BoxFilter") or not set(GUIDES) <= set(settings["layers"]):
+        raise click.ClickException(
+            f"--denoise needs the layers {' and '.join(GUIDES)} and the film's filter \"box\": "
+            "render the parts so."
+        )
 
 
 def _output_path(name: str | Path, suffix: str, option: str) -> Path:
@@ -339,47 +513,30 @@ def _output_path(name: str | Path, suffix: str, option: str) -> Path:
     return path
 
 
-@contextlib.contextmanager
-def _replacing(path: Path):
-    """A file to write in the same folder, which takes the place of `path` if all goes well."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield str(part)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+def _note(sentence: str) -> None:
+    click.echo(sentence, err=True)
 
 
-def _write_png(film, path: str) -> None:
-    import mitsuba as mi
-
-    pixel = mi.Bitmap.PixelFormat
-    bitmap = film.bitmap()
-    if bitmap.pixel_format() == pixel.MultiChannel:
-        bitmap = dict(bitmap.split())["<root>"]
-    formats = {pixel.XYZ: pixel.RGB, pixel.XYZA: pixel.RGBA}
-    bitmap.convert(
-        formats.get(bitmap.pixel_format(), bitmap.pixel_format()), mi.Struct.Type.UInt8, True
-    ).write(path)
+def _silence(_sentence: str) -> None:
+    pass
 
 
-def _metadata(mi, scene: str, integrator, spp: int, seed: int, seconds: float) -> dict:
-    import drjit as dr
+# ---------------------------------------------------------------------- Mitsuba
 
-    metadata = {
-        "scene": scene,
-        "spp": spp,
-        "seed": seed,
-        "integrator": str(integrator),
-        "renderTime": float(seconds),
-        "variant": mi.variant(),
-        "software": f"nil_mitsuba {__version__}, Mitsuba {mi.__version__}, Dr.Jit {dr.__version__}",
-        "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
-    }
-    for name in RECORDED:
-        if hasattr(integrator, name):  # a wrapper of Mitsuba's does not pass them on
-            value = getattr(integrator, name)
-            metadata[name] = str(value).lower() if isinstance(value, bool) else value
-    if hasattr(integrator, "cell_origin"):
-        metadata["cell_origin"] = "{:.9g},{:.9g},{:.9g}".format(*integrator.cell_origin)
-    return metadata
+
+def _set_variant(variant: str, verbose: int) -> None:
+    """Set a variant, if it can run "nil"."""
+    mi.set_log_level(
+        (mi.LogLevel.Warn, mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[min(verbose, 3)]
+    )
+    if variant in mi.variants():
+        sentence = refusal(variant)
+        if sentence:
+            raise click.ClickException(sentence)
+    mi.set_variant(variant)
+
+
+def _resolver(folder: Path):
+    resolver = mi.FileResolver(mi.file_resolver())
+    resolver.prepend(str(folder))
+    return resolver

@@ -29,6 +29,8 @@ POINT_LAYERS = {layer: FILE_LAYERS[layer].channels for layer in ("cell", "shape"
 COUNT_LAYERS = {"samples": FILE_LAYERS["samples"].channels}
 LAYERS = MEAN_LAYERS | POINT_LAYERS | COUNT_LAYERS
 
+NO_PIXEL = 2**32 - 1  # number of a pixel outside of the crop
+
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB, as Mitsuba weighs it
 
 
@@ -59,7 +61,8 @@ class Sums:
         Raises ValueError if a pass is in both.
         """
         passes = joined(self.passes, other.passes)
-        first = other if other.passes[:1] < self.passes[:1] or not self.passes else self
+        first = min((sums for sums in (self, other) if sums.passes), default=self,
+                    key=lambda sums: sums.passes[0])
         sums = Sums(self.values + other.values, self.moments + other.moments, first.points, passes)
         dr.eval(sums.values, sums.moments)
         return sums
@@ -129,9 +132,10 @@ class Passes:
             points = dr.zeros(mi.Int32, crop.y * crop.x * depth)
             for band in range(self.bands):
                 self._render_band(block, points, index * self.bands + band, band * self.band)
-            values = mi.TensorXd(block.tensor())
-            return Sums(values, self._moments(values), mi.TensorXi(points, (crop.y, crop.x, depth)),
-                        ((index, index + 1),))
+            # Double precision only while they are added: a third of the memory
+            values = block.tensor()
+            return Sums(mi.TensorXd(values), self._moments(values),
+                        mi.TensorXi(points, (crop.y, crop.x, depth)), ((index, index + 1),))
 
     def develop(self, sums: Sums) -> mi.TensorXf:
         """The image (height × width × channels) of what passes have added up to.
@@ -161,10 +165,22 @@ class Passes:
             alpha=dr.select(valid & inside, mi.Float(1), 0),
             aovs=self._channels(seen, MEAN_LAYERS), wavelengths=ray.wavelengths,
         )
-        self._scatter_points(points, seen, number, inside)
-        del sampler, ray, weight, position, p, v, cone, radiance, valid, seen, number, inside
-        dr.eval(block.tensor(), points)
+        channels = self._channels(seen, POINT_LAYERS)
+        del sampler, ray, weight, position, p, v, cone, radiance, valid, seen, inside
+        # Together: what is evaluated later would be traced again
+        dr.eval(block.tensor(), [number, *channels] if channels else [])
+        if channels:
+            self._scatter_first(points, number, channels)
         dr.sync_thread()
+
+    def _scatter_first(self, points, number, channels):
+        """Give each pixel the channels of its first sample."""
+        sample = dr.arange(mi.UInt32, self.band) * dr.opaque(mi.UInt32, self.spp)
+        number = dr.gather(mi.UInt32, number, sample)
+        for i, channel in enumerate(channels):
+            dr.scatter(points, dr.gather(mi.Int32, channel, sample), number * len(channels) + i,
+                       number != NO_PIXEL)
+        dr.eval(points)
 
     def _sample_rays(self, sampler, first):
         """Camera rays of the pixels from number ``first`` on, as `ADIntegrator.sample_rays`."""
@@ -176,9 +192,9 @@ class Passes:
         if film.sample_border():
             place -= film.rfilter().border_size()
         # A pixel's own number in the crop; those of the border have none
-        own = (place.x >= 0) & (place.y >= 0) & (place.x < film.crop_size().x) \
-            & (place.y < film.crop_size().y) & (index % dr.opaque(mi.UInt32, self.spp) == 0)
-        number = dr.select(own, mi.UInt32(place.y * film.crop_size().x + place.x), 0xFFFFFFFF)
+        own = inside & (place.x >= 0) & (place.y >= 0) & (place.x < film.crop_size().x) \
+            & (place.y < film.crop_size().y)
+        number = dr.select(own, mi.UInt32(place.y * film.crop_size().x + place.x), NO_PIXEL)
 
         place += mi.Vector2i(film.crop_offset())
         position = mi.Vector2f(place) + sampler.next_2d()
@@ -200,12 +216,6 @@ class Passes:
     def _channels(self, seen, of):
         return [channel for layer in of if layer in self.layers for channel in seen[layer]]
 
-    def _scatter_points(self, points, seen, number, inside):
-        channels = self._channels(seen, POINT_LAYERS)
-        active = inside & (number != 0xFFFFFFFF)
-        for i, channel in enumerate(channels):
-            dr.scatter(points, channel, number * len(channels) + i, active)
-
 
 def develop(film: mi.Film, layers: tuple[str, ...], sums: Sums, pass_spp: int) -> mi.TensorXf:
     """The image in ``film`` of passes of ``pass_spp`` samples that rendered ``layers``, too."""
@@ -219,10 +229,14 @@ def develop(film: mi.Film, layers: tuple[str, ...], sums: Sums, pass_spp: int) -
     return dr.concat([image, *further], axis=2) if further else image
 
 
-def luminance(film: mi.Film, values: mi.TensorXd) -> tuple[mi.Float64, mi.Float64]:
+def luminance(film: mi.Film, values: mi.TensorXf | mi.TensorXd) -> tuple[mi.Float64, mi.Float64]:
     """Sums of luminances and of weights by pixel, out of the channels that a film sums up."""
     channels = values.shape[2]
     pixel = dr.arange(mi.UInt32, values.shape[0] * values.shape[1]) * channels
+
+    def channel(i):
+        return mi.Float64(dr.gather(type(values.array), values.array, pixel + i))
+
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         # Bands of its own, none more important than another; the last channel is the weight
         weight = channels - 1
@@ -230,8 +244,7 @@ def luminance(film: mi.Film, values: mi.TensorXd) -> tuple[mi.Float64, mi.Float6
     else:
         weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
         colours = LUMINANCE
-    total = sum(c * dr.gather(mi.Float64, values.array, pixel + i) for i, c in enumerate(colours))
-    return total, dr.gather(mi.Float64, values.array, pixel + weight)
+    return sum(c * channel(i) for i, c in enumerate(colours)), channel(weight)
 
 
 def pass_seed(seed: int, index: int) -> int:

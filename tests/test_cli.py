@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from nil_mitsuba import cli, exr
+from nil_mitsuba import cli, exr, scene_files, stills
 
 SENSOR = """
     <sensor type="perspective">
@@ -159,6 +159,263 @@ def test_help_and_version_are_no_errors(command):
     assert status == 0 and out.startswith("nil-mitsuba ")
 
 
+# ------------------------------------------------------- layers and pictures
+
+
+BOX = SENSOR.replace("</film>", '<rfilter type="box"/></film>').replace("$format", "float32")
+BALL = """
+    <shape type="sphere" id="ball">
+        <point name="center" x="0.3" y="0.5" z="0.6"/><float name="radius" value="0.1"/>
+        <bsdf type="diffuse"/>
+    </shape>
+    <bsdf type="diffuse" id="paper"/>
+    <shape type="ply"><string name="filename" value="a.ply"/><ref id="paper"/></shape>
+    <shape type="ply"><string name="filename" value="b.ply"/><ref id="paper"/></shape>
+"""
+TRIANGLE = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+{x} .1 .9
+{x} .9 .9
+.5 .5 .9
+3 0 1 2
+"""
+
+
+@pytest.fixture
+def meshes(folder):
+    """A scene with two meshes, which Mitsuba would make one of."""
+    (folder / "a.ply").write_text(TRIANGLE.format(x=0.05))
+    (folder / "b.ply").write_text(TRIANGLE.format(x=0.95))
+    (folder / "scene.xml").write_text(scene(NIL, BOX, LAMP, BALL))
+    return folder
+
+
+def planes(path):
+    """The channels of a file by name, as lists of rows."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels.tolist() for name, channel in file.channels().items()}
+
+
+def assert_close(rows, others):
+    """Other kernels round otherwise."""
+    for row, expected in zip(rows, others):
+        assert row == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_layers_are_in_the_file_and_shapes_have_the_numbers_of_the_scene(command, meshes):
+    status, _, err = command("render", "scene.xml", "--spp", "8", "--layers",
+                             "samples,shape, distance,position,normal,albedo,cell")
+    assert (status, err) == (0, "")
+    header, types, _ = read("scene.exr")
+    vectors = [f"{layer}.{c}" for layer in ("cell", "normal", "position") for c in "XYZ"]
+    assert set(types) == {"R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "depth.Z",
+                          "samples.X", "shape.X", *vectors}
+    found = planes("scene.exr")
+    assert {value for row in found["samples.X"] for value in row} == {8}
+    numbers = {value for row in found["shape.X"] for value in row}
+    assert numbers == {-1, 0, 1, 2, 3}  # background, lamp, ball, two meshes
+    assert header["layers"] == "distance,position,normal,albedo,cell,shape,samples"
+    command("render", "scene.xml", "--spp", "8", "-o", "plain.exr")  # with merged meshes
+    assert_close(found["R"], planes("plain.exr")["R"])
+
+
+def test_denoising_keeps_the_noisy_picture(command, meshes):
+    pytest.importorskip("mitsuba_oidn")
+    status, _, err = command("render", "scene.xml", "--denoise", "--png", "a.png", "--spp", "8")
+    assert (status, err) == (0, "")
+    found = planes("scene.exr")
+    assert set(found) == {"R", "G", "B", "noisy.R", "noisy.G", "noisy.B"}
+    assert found["R"] != found["noisy.R"]
+    command("render", "scene.xml", "--spp", "8", "-o", "plain.exr")
+    assert_close(found["noisy.R"], planes("plain.exr")["R"])
+
+    # A filter that spreads noise over pixels gives way.
+    (meshes / "scene.xml").write_text(scene(NIL, SENSOR, LAMP, BALL))
+    status, _, err = command("render", "scene.xml", "--denoise", "--layers", "normal")
+    assert status == 0 and '"gaussian" is replaced by "box"' in err
+    assert "normal.X" in planes("scene.exr") and "albedo.R" not in planes("scene.exr")
+
+
+def test_exposure_and_a_filmic_curve_change_the_png_alone(command, folder):
+    sky = '<emitter type="constant"><float name="radiance" value="0.5"/></emitter>'
+    (folder / "sky.xml").write_text(scene(NIL, BOX, sky))
+    plain = ("render", "sky.xml", "--png", "sky.png", "-P", "quotient=false")
+    levels = []
+    for options in ((), ("--exposure", "-1"), ("--filmic",), ("--exposure", "3")):
+        assert command(*plain, *options)[0] == 0
+        levels.append(mi.TensorXu8(mi.Bitmap("sky.png"))[4, 6, 0].array[0])
+        assert planes("sky.exr")["R"][0][0] == 0.5
+    assert levels[1] in (136, 137)  # 255 (1.055 · 0.25^(1/2.4) − 0.055) = 136.96
+    assert levels[0] != levels[2] < 255 == levels[3]
+
+
+def test_compression_is_chosen(command):
+    assert command("render", "scene.xml", "--compression", "piz")[0] == 0
+    assert "compression piz" in command("info", "scene.exr")[1]
+
+
+def test_info_tells_how_to_render_it_again(command):
+    command("render", "scene.xml", "--seed", "5", "--layers", "distance")
+    first = planes("scene.exr")
+    status, out, err = command("info", "scene.exr")
+    assert (status, err) == (0, "")
+    assert re.search(r"^  seed +5$", out, re.M) and re.search(r"^  sceneHash +\w{64}$", out, re.M)
+    line = re.search(r"^  commandLine +nil-mitsuba (.*)$", out, re.M)[1]
+    assert command(*line.split())[0] == 0
+    assert planes("scene.exr") == first
+
+
+def test_a_picture_tells_another_time_from_another_scene(command, folder):
+    hashes = []
+    for text in (scene(NIL, SENSOR, LAMP), scene(NIL, SENSOR, LAMP).replace("0.15", "0.16")):
+        (folder / "scene.xml").write_text(text)
+        command("render", "scene.xml", "--spp", "9")
+        hashes.append(read("scene.exr")[0]["sceneHash"])
+    assert hashes[0] != hashes[1]
+
+
+# ------------------------------------------------------ checkpoints and parts
+
+
+def test_a_still_is_rendered_for_a_time_or_down_to_a_noise(command, monkeypatch):
+    monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 4)
+    assert command("render", "scene.xml", "--noise", "0.2")[0] == 0
+    by_noise = read("scene.exr")[0]["spp"]
+    assert by_noise >= 16 and by_noise % 4 == 0
+    assert command("render", "scene.xml", "--time", "0.4s")[0] == 0
+    header = read("scene.exr")[0]
+    assert 0.4 <= header["renderTime"] < 20 and header["spp"] % 4 == 0
+    assert command("render", "scene.xml", "--time", "1h", "--noise", "1e-9", "--spp", "8")[0] == 0
+    assert read("scene.exr")[0]["spp"] == 8
+
+
+@pytest.mark.parametrize(
+    "text, seconds",
+    [("90", 90), ("90s", 90), ("30m", 1800), ("1.5h", 5400), ("1h30m", 5400), ("2m5s", 125)],
+)
+def test_times_are_read(text, seconds):
+    assert cli.Duration().convert(text, None, None) == seconds
+
+
+def test_a_checkpoint_that_is_named_stays_and_more_samples_go_on_with_it(command, folder):
+    for spp in ("8", "24"):
+        status, out, err = command("render", "scene.xml", "--spp", spp, "--checkpoint", "a.sums",
+                                   "--resume", "-q")
+        assert (status, out, err) == (0, "scene.exr\n", "")
+    assert (folder / "a.sums").exists()
+    header, _, pixels = read("scene.exr")
+    assert (header["spp"], header["passes"]) == (24, "0:3 of 8 samples per pixel")
+    assert "passes" in command("info", "a.sums")[1]
+
+    status, _, err = command("render", "scene.xml", "--spp", "24", "--checkpoint", "a.sums")
+    assert status == 1 and "--resume" in complaint(err)
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR, LAMP.replace("0.15", "0.2")))
+    status, _, err = command("render", "scene.xml", "--checkpoint", "a.sums", "--resume")
+    assert status == 1 and "has changed" in complaint(err)
+
+
+def test_without_a_checkpoint_resuming_begins_anew_and_says_so(command, folder):
+    status, out, err = command("render", "scene.xml", "--resume")
+    assert (status, out) == (0, "scene.exr\n")
+    assert err == 'there is no checkpoint "scene.sums": beginning with the first pass.\n'
+    assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.xml"]
+
+
+def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
+    from nil_mitsuba import passes
+
+    monkeypatch.setattr(passes, "WAVEFRONT_SAMPLES", 12 * 8 * 4)
+    render = ("render", "scene.xml", "--spp", "16", "-D", "format=float32")
+    assert command(*render)[0] == 0
+    whole = planes("scene.exr")
+    for part in ("2:4", "0:1", "1:2"):
+        name = f"scene.{part.replace(':', '-')}.sums"
+        assert command(*render, "--passes", part)[:2] == (0, name + "\n")
+
+    parts = ["scene.0-1.sums", "scene.2-4.sums"]
+    status, out, err = command("merge", *parts, "-o", "merged.exr")
+    assert (status, out) == (0, "merged.exr\n")
+    assert err == "the passes 1:2 of 0:4 are missing.\n"
+    status, out, err = command("merge", *parts, "scene.1-2.sums", "-o", "merged.exr", "--png",
+                               "merged.png")
+    assert (status, out, err) == (0, "merged.exr\nmerged.png\n", "")
+    merged = planes("merged.exr")
+    for name in "RGB":
+        for row, expected in zip(merged[name], whole[name]):
+            assert row == pytest.approx(expected, rel=1e-6)
+    header, sound = read("merged.exr")[0], read("scene.exr")[0]
+    for name in ("spp", "seed", "sceneHash", "integrator", "twist", "passes"):
+        assert header[name] == sound[name]
+
+    # In steps, too
+    assert command("merge", *parts, "-o", "two.sums")[0] == 0
+    assert command("merge", "scene.1-2.sums", "two.sums", "-o", "again.exr")[0] == 0
+    assert planes("again.exr") == merged
+
+    # Bad parts get a sentence, and the picture stays
+    before = (folder / "merged.exr").read_bytes()
+    command("render", "scene.xml", "--spp", "16", "--passes", "0:1", "--seed", "1", "-o", "b.sums")
+    (folder / "c.sums").write_text("nothing")
+    for names, fragments in (
+        (["scene.0-1.sums", "two.sums"], ["passes 0:1", "twice"]),
+        (["scene.2-4.sums", "b.sums"], ["seed is 0 there and 1 here"]),
+        (["scene.2-4.sums", "c.sums"], ["c.sums", "no checkpoint"]),
+        (["scene.2-4.sums", "d.sums"], ["d.sums", "No such file"]),
+    ):
+        status, _, err = command("merge", *names, "-o", "merged.exr")
+        line = complaint(err)
+        assert status == 1 and [f for f in fragments if f not in line] == []
+    assert (folder / "merged.exr").read_bytes() == before
+
+
+def test_merged_parts_can_be_denoised(command, meshes):
+    pytest.importorskip("mitsuba_oidn")
+    command("render", "scene.xml", "--spp", "8", "--passes", "0:1", "-o", "a.sums")
+    status, _, err = command("merge", "a.sums", "-o", "a.exr", "--denoise")
+    assert status == 1 and "--denoise needs the layers albedo and normal" in complaint(err)
+    command("render", "scene.xml", "--spp", "8", "--passes", "0:1", "-o", "b.sums", "--layers",
+            "albedo,normal")
+    assert command("merge", "b.sums", "-o", "b.exr", "--denoise")[0] == 0
+    assert "noisy.R" in planes("b.exr")
+
+
+def test_a_checkpoint_that_cannot_be_written_is_told_once(command, folder, monkeypatch):
+    def full(*_):
+        raise OSError('cannot write "scene.sums": No space left on device.')
+
+    monkeypatch.setattr(stills, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8)
+    monkeypatch.setattr(stills.checkpoint, "save", full)
+    status, out, err = command("render", "scene.xml", "--noise", "1e-9", "--spp", "4")
+    assert (status, out) == (0, "scene.exr\n")
+    assert len(err.splitlines()) == 1 and "No space left on device" in err
+
+
+def test_a_bar_tells_samples_rate_time_and_noise_on_a_terminal(command, monkeypatch):
+    import io
+
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 4)
+    command("render", "scene.xml", "--noise", "1e-9", "--spp", "16")
+    bar = terminal.getvalue()
+    for fragment in ("16/16 samples per pixel", "M/s", "elapsed", "left", "noise 0."):
+        assert fragment in bar
+    terminal.truncate(0)
+    command("render", "scene.xml", "--quiet")
+    assert terminal.getvalue().strip("\0") == ""
+
+
 # --------------------------------------------------------- scenes as they are
 
 
@@ -245,12 +502,12 @@ def test_fit_puts_the_scene_into_the_cell(command, folder):
      ("abc", "abc"), ("1,2", "1,2")],
 )  # fmt: skip
 def test_properties_have_the_type_they_look_like(rgb, text, value):
-    parsed = cli.parse_value(rgb, text)
+    parsed = scene_files.parse_value(text)
     assert parsed == value and type(parsed) is type(value)
 
 
 def test_three_numbers_are_a_vector(rgb):
-    assert list(cli.parse_value(rgb, "-1,0.5,2")) == [-1, 0.5, 2]
+    assert list(scene_files.parse_value("-1,0.5,2")) == [-1, 0.5, 2]
 
 
 # ------------------------------------------------------------------ bad input
@@ -298,6 +555,20 @@ BAD_ARGUMENTS = {
     "no value": (["scene.xml", "-P", "twist"], 2, ["key=value", "twist"]),
     "unknown option": (["scene.xml", "--sp", "3", "--foo"], 2, ["--"]),
     "no scene": ([], 2, ["SCENE.xml"]),
+    "unknown layer": (["scene.xml", "--layers", "depth"], 1, ['"depth"', "distance"]),
+    "unknown compression": (["scene.xml", "--compression", "jpg"], 2, ["--compression", "zip"]),
+    "no time": (["scene.xml", "--time", "soon"], 2, ["--time", "30m"]),
+    "no time at all": (["scene.xml", "--time", "0s"], 2, ["--time", "30m"]),
+    "no noise": (["scene.xml", "--noise", "0"], 2, ["--noise"]),
+    "NaN noise": (["scene.xml", "--noise", "nan"], 2, ["noise"]),
+    "too much light": (["scene.xml", "--exposure", "1000"], 2, ["--exposure"]),
+    "not a checkpoint": (["scene.xml", "--checkpoint", "a.exr"], 2, ["--checkpoint", ".sums"]),
+    "no folder for it": (["scene.xml", "--checkpoint", "no/a.sums"], 1, ["cannot write", "no"]),
+    "no passes": (["scene.xml", "--passes", "3:3"], 2, ["--passes", "a < b"]),
+    "passes of another kind": (["scene.xml", "--passes", "3"], 2, ["--passes", "a:b"]),
+    "too many passes": (["scene.xml", "--passes", "0:2"], 1, ["0:1", "4 samples"]),
+    "a part as picture": (["scene.xml", "--passes", "0:1", "-o", "a.exr"], 2, [".sums"]),
+    "a part of a time": (["scene.xml", "--passes", "0:1", "--time", "3s"], 2, ["--time"]),
 }
 
 
@@ -315,7 +586,8 @@ def rendering_is_an_error(monkeypatch):
     def render(*_):
         raise AssertionError("rendering began")
 
-    monkeypatch.setattr(cli, "_render", render)
+    monkeypatch.setattr(stills.Still, "accumulate", render)
+    monkeypatch.setattr(cli, "_render_in_one_go", render)
 
 
 @pytest.mark.parametrize("name", BAD_SCENES)
@@ -348,6 +620,30 @@ def test_bad_arguments_get_one_sentence_before_rendering(
     assert sorted(p.name for p in folder.iterdir()) == ["dir.exr", "scene.exr", "scene.xml"]
 
 
+@pytest.mark.parametrize("option", ["--noise=1", "--time=1s", "--resume", "--checkpoint=a.sums",
+                                    "--passes=0:1"])  # fmt: skip
+def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
+    moment = '<integrator type="moment"><integrator type="nil"/></integrator>'
+    (folder / "scene.xml").write_text(scene(moment, SENSOR, LAMP))
+    status, _, err = command("render", "scene.xml", option)
+    assert status == 1 and option.partition("=")[0] in complaint(err)
+    assert [p.name for p in folder.iterdir()] == ["scene.xml"]
+
+
+@pytest.mark.parametrize(
+    "arguments, expected, fragments",
+    [(["info", "a.exr"], 1, ["a.exr"]), (["info", "scene.xml"], 1, ["scene.xml"]),
+     (["info", "a.sums"], 1, ["a.sums", "No such file"]), (["merge", "-o", "a.exr"], 2, ["PARTS"]),
+     (["merge", "scene.xml"], 2, ["-o"]),
+     (["merge", "scene.xml", "-o", "a.exr"], 1, ["scene.xml", "no checkpoint"])],
+)  # fmt: skip
+def test_files_that_are_not_there_or_something_else(command, arguments, expected, fragments):
+    status, out, err = command(*arguments)
+    line = complaint(err)
+    assert (status, out) == (expected, "")
+    assert [fragment for fragment in fragments if fragment not in line] == []
+
+
 def test_fit_needs_something_to_fit(command, folder):
     (folder / "scene.xml").write_text(scene(NIL, SENSOR))
     status, _, err = command("render", "scene.xml", "--fit")
@@ -358,23 +654,31 @@ def test_a_failed_write_leaves_the_earlier_pictures(command, folder, monkeypatch
     for name in ("scene.exr", "scene.png"):
         (folder / name).write_text("an earlier picture")
 
-    def full(path, *_):
+    def full(path, _):
         open(path, "w").write("half a pict")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(exr, "write_film", full)
-    status, _, err = command("render", "scene.xml", "--png", "scene.png")
+    with monkeypatch.context() as patch:
+        patch.setattr(exr, "_write", full)
+        status, _, err = command("render", "scene.xml", "--png", "scene.png")
     assert status == 1 and "No space left on device" in complaint(err)
-    assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.png", "scene.xml"]
+    assert '"scene.sums"' in err and "--resume" in err
+    names = ["scene.exr", "scene.png", "scene.sums", "scene.xml"]
+    assert sorted(p.name for p in folder.iterdir()) == names
     for name in ("scene.exr", "scene.png"):
         assert (folder / name).read_text() == "an earlier picture"
 
+    # Nothing is rendered again.
+    monkeypatch.setattr(stills.Still, "render", None)
+    assert command("render", "scene.xml", "--resume")[:2] == (0, "scene.exr\n")
+    assert read("scene.exr")[0]["spp"] == 4
 
-def test_an_interrupted_render_writes_nothing(command, folder, monkeypatch):
+
+def test_a_second_interruption_does_not_wait(command, folder, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_render", interrupted)
+    monkeypatch.setattr(stills.Still, "render", interrupted)
     status, _, err = command("render", "scene.xml")
     assert status == 130 and "interrupted" in complaint(err)
     assert [p.name for p in folder.iterdir()] == ["scene.xml"]

@@ -1,0 +1,523 @@
+"""Pictures of any sample count: pass after pass until a rule says stop, saved on the way.
+
+A still is a sum of passes. Whoever renders them, here, after an interruption or on another machine,
+gets the same image: each pass has a seed of its own, and sums are kept in double precision.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import re
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import __version__, checkpoint
+from .checkpoint import Checkpoint
+from .exr import component_format
+from .scene_files import Job, SceneFiles
+
+# A checkpoint is never older than this, as long as no single pass and no writing takes longer.
+CHECKPOINT_SECONDS = 60.0
+
+# With a rule for time or noise, passes have so many samples in all, at least one per pixel: the
+# rules are looked at between passes. Each pass costs a tenth of a second besides its samples.
+LOOK_SAMPLES = 2**19
+
+# The variance between fewer passes says little about a picture of few pixels.
+NOISE_PASSES = 4
+
+# Parameters of the integrator that determine the picture.
+PARAMETERS = (
+    "twist", "quotient", "cell_origin", "cell_size", "tolerance", "max_distance",
+    "max_depth", "rr_depth", "hide_emitters",
+)  # fmt: skip
+
+# Mitsuba's names for the pixel formats of a film, in a scene and in the film's description.
+PIXEL_FORMATS = {"y": "luminance", "ya": "luminance_alpha"}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When to stop: samples per pixel, seconds of rendering, noise (see ``noise``).
+
+    Whichever comes first counts; at least one of them has to be given.
+    """
+
+    spp: int | None = None
+    seconds: float | None = None
+    noise: float | None = None
+
+    def met(self, progress: Progress) -> bool:
+        return (
+            (self.spp is not None and progress.samples >= self.spp)
+            or (self.seconds is not None and progress.seconds >= self.seconds)
+            or (self.noise is not None and progress.noise is not None
+                and progress.passes >= NOISE_PASSES and progress.noise <= self.noise)
+        )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a still is: passes, samples per pixel, seconds of rendering, and the noise so far
+    (None before the second pass); ``rules`` are those that will end it."""
+
+    passes: int
+    samples: int
+    seconds: float
+    noise: float | None
+    rules: Rules
+
+    @property
+    def left(self) -> float | None:
+        """Estimated seconds until the first rule is met; None if nothing can be said yet."""
+        rules, estimates = self.rules, []
+        if rules.seconds is not None:
+            estimates.append(rules.seconds - self.seconds)
+        if self.samples:
+            if rules.spp is not None:
+                estimates.append(self.seconds * (rules.spp / self.samples - 1))
+            if rules.noise is not None and self.noise is not None:
+                # Noise falls with the square root of the number of samples
+                estimates.append(self.seconds * ((self.noise / rules.noise) ** 2 - 1))
+        return max(0.0, min(estimates)) if estimates else None
+
+
+class Interrupted(KeyboardInterrupt):
+    """A still was stopped by Ctrl-C or SIGTERM; ``image`` is what there is of it."""
+
+    def __init__(self, image: mi.TensorXf, sentence: str):
+        super().__init__(sentence)
+        self.image = image
+
+
+class Still:
+    """An image of a scene that is rendered in passes.
+
+    ``settings`` is what has to be equal for sums of passes to belong together. Raises ValueError
+    if the integrator is not "nil" itself, which renders passes.
+    """
+
+    def __init__(self, scene: mi.Scene, sensor: int = 0, integrator=None, seed: int = 0,
+                 rules: Rules = Rules(), pass_spp: int | None = None,
+                 scene_hash: str | None = None):
+        from .passes import Passes  # of the current variant
+
+        integrator = integrator or scene.integrator()
+        if not hasattr(integrator, "view"):
+            raise ValueError(
+                f'the integrator "{type(integrator).__name__}" renders in one go: only "nil" '
+                "itself, with no other integrator around it, renders in passes."
+            )
+        sensor_number, sensor = sensor, scene.sensors()[sensor]
+        self.film = sensor.film()
+        if pass_spp is None and (rules.seconds or rules.noise):
+            pass_spp = max(1, LOOK_SAMPLES // dr.prod(self.film.crop_size()))
+            pass_spp = min(pass_spp, rules.spp or pass_spp)
+        self.passes = Passes(integrator, scene, sensor, seed, rules.spp or 0, pass_spp)
+        if rules == Rules():
+            rules = Rules(spp=self.passes.count * self.passes.spp)
+        self.rules = rules
+        self.settings = {
+            "scene": scene_hash or hash_of_scene(scene),
+            "sensor": sensor_number,
+            "seed": seed,
+            "pass_spp": self.passes.spp,
+            "sampler": self.passes.sampler.class_name(),
+            "film": film_settings(self.film),
+            "layers": list(integrator.layers),
+            "integrator": {name: _plain(getattr(integrator, name)) for name in PARAMETERS},
+            "variant": mi.variant(),
+            "versions": versions(),
+        }
+
+    @property
+    def count(self) -> int | None:
+        """Number of passes that hold the samples asked for; None if only time or noise end it."""
+        return math.ceil(self.rules.spp / self.passes.spp) if self.rules.spp else None
+
+    def nothing(self) -> Checkpoint:
+        """The sums of no passes."""
+        return Checkpoint(self.settings, self.passes.nothing())
+
+    def render(self, index: int) -> Checkpoint:
+        """Pass number ``index``."""
+        start = time.perf_counter()
+        sums = self.passes.render(index)
+        return Checkpoint(self.settings, sums, time.perf_counter() - start)
+
+    def start(self, path: str | os.PathLike | None, resume: bool) -> Checkpoint:
+        """What there is to go on with: nothing, or with ``resume`` the checkpoint at `path`.
+
+        Raises ValueError if that is of another still, and FileExistsError if it is there and not
+        to be resumed.
+        """
+        if path is None or not os.path.lexists(path):
+            return self.nothing()
+        if not resume:
+            raise FileExistsError(
+                f'"{path}" holds the samples of an earlier render: resume it (--resume, '
+                "resume=True), or remove the file."
+            )
+        state = checkpoint.load(path)
+        try:
+            state.require(self.settings)
+        except ValueError as error:
+            raise ValueError(f'cannot go on with "{path}": {error}') from None
+        return state
+
+    def todo(self, state: Checkpoint, first: int = 0, stop: int | None = None) -> Iterator[int]:
+        """Numbers of the passes from ``first`` on, up to ``stop``, that are not in ``state``."""
+        index = first
+        for present, end in (*state.sums.passes, (math.inf, math.inf)):
+            while index < min(present, math.inf if stop is None else stop):
+                yield index
+                index += 1
+            index = max(index, end)
+
+    def accumulate(self, state: Checkpoint, parts: Iterable[Checkpoint],
+                   progress: Callable[[Progress], None] | None = None,
+                   saver: Saver | None = None) -> tuple[Checkpoint, int | None]:
+        """Add parts until there are no more, a rule is met, or a signal comes.
+
+        ``parts`` yields checkpoints of passes as they are rendered, by whomever. Returns the sums
+        and the number of the signal. In the main thread Ctrl-C and SIGTERM wait for the pass that
+        is being rendered; a second one does not.
+        """
+        parts = iter(parts)
+        before, start = state.seconds, time.perf_counter()
+        with interruption() as signals:
+            while True:
+                state.seconds = before + time.perf_counter() - start
+                report = Progress(state.sums.count, state.sums.count * self.passes.spp,
+                                  state.seconds, noise(self.film, state.sums), self.rules)
+                if progress is not None:
+                    progress(report)
+                if signals or self.rules.met(report):
+                    break
+                part = next(parts, None)
+                if part is None:
+                    break
+                state = state.plus(part)
+                state.seconds = before + time.perf_counter() - start  # As on a clock on the wall
+                if saver is not None:
+                    saver.after_pass(state)
+        return state, signals[0] if signals else None
+
+    def develop(self, state: Checkpoint) -> mi.TensorXf:
+        """The image, as ``mi.render`` returns it: height × width × channels."""
+        return self.passes.develop(state.sums)
+
+
+class Saver:
+    """Keeps a checkpoint of a growing still, never older than `CHECKPOINT_SECONDS`.
+
+    What cannot be written is told to ``complain`` once, and rendering goes on: the last checkpoint
+    that could be written stays.
+    """
+
+    def __init__(self, path: str | os.PathLike, complain: Callable[[str], None]):
+        self.path = path
+        self.complain = complain
+        self.complained = False
+        self.saved = self.passed = time.perf_counter()  # State of the last checkpoint, last pass
+        self.pass_seconds = self.write_seconds = 0.0    # The longest so far
+
+    def after_pass(self, state: Checkpoint) -> None:
+        """Save, if the checkpoint were too old after one more pass."""
+        now = time.perf_counter()
+        self.pass_seconds = max(self.pass_seconds, now - self.passed)
+        self.passed = now
+        if now + self.pass_seconds + self.write_seconds >= self.saved + CHECKPOINT_SECONDS:
+            self.save(state)
+            self.passed = time.perf_counter()
+
+    def save(self, state: Checkpoint) -> bool:
+        """Save now; whether that went well."""
+        start = time.perf_counter()
+        try:
+            checkpoint.save(self.path, state)
+        except OSError as error:
+            if not self.complained:
+                self.complain(f"{error} The last checkpoint, if there was one, is as it was.")
+            self.complained = True
+            return False
+        self.saved = start
+        self.write_seconds = max(self.write_seconds, time.perf_counter() - start)
+        return True
+
+
+def render(
+    scene: mi.Scene,
+    sensor: int = 0,
+    integrator=None,
+    *,
+    spp: int | None = None,
+    seconds: float | None = None,
+    noise: float | None = None,
+    seed: int = 0,
+    checkpoint: str | os.PathLike | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> mi.TensorXf:
+    """Render a still until it has `spp` samples per pixel, or `seconds` or `noise` are reached.
+
+    Without any of the three the scene's sample count holds. `integrator` (the scene's, if None) has
+    to be "nil". The image is a tensor, height × width × channels, those of the integrator's layers
+    (`aovs`) behind the picture's. `noise` is the relative error that `nil_mitsuba.stills.noise`
+    estimates. `progress` is called between passes with a ``stills.Progress``.
+
+    At least once a minute and at the end the sums are written to the file `checkpoint`; with
+    `resume` they are read from there first, if it exists, and `seconds` and `spp` count what was
+    done before. The file stays, so that a larger `spp` can go on with it. Ctrl-C and SIGTERM, in
+    the main thread, finish the pass, save the sums and raise ``stills.Interrupted``, a
+    KeyboardInterrupt whose ``image`` is the image so far.
+
+    Raises ValueError for arguments and checkpoints that do not fit and FileExistsError for a
+    checkpoint that is not to be resumed; what cannot be written is a warning while rendering goes
+    on.
+    """
+    rules = check_rules(spp, seconds, noise)
+    still = Still(scene, sensor, integrator, seed, rules, pass_spp_of(checkpoint, resume))
+    state = still.start(checkpoint, resume)
+    saver = Saver(checkpoint, warnings.warn) if checkpoint is not None else None
+    parts = (still.render(index) for index in still.todo(state, stop=still.count))
+    state, signal_number = still.accumulate(state, parts, progress, saver)
+    if saver is not None:
+        saver.save(state)
+    image = still.develop(state)
+    dr.eval(image)
+    if signal_number is not None:
+        raise Interrupted(image, "interrupted; the exception's image is what there is.")
+    return image
+
+
+def noise(film: mi.Film, sums) -> float | None:
+    """Estimated relative error of an image, from what its passes differ by; None below two passes.
+
+    It is the root mean square, over all pixels, of the standard error of a pixel's luminance,
+    divided by that luminance or by the mean luminance of the image, whichever is larger. A single
+    pixel counts 1 at most, so that a few bright specks do not hide how far the rest is.
+
+    A pixel's luminance is the ratio R = ΣS/ΣW of sums over n passes; the variance of such a ratio
+    is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13).
+    """
+    from .passes import luminance
+
+    total, weight = luminance(film, sums.values)
+    pixels = len(weight)
+    ss, sw, ww = (dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels)
+                            + i * pixels) for i in range(3))
+    n = dr.opaque(mi.Float64, sums.count)
+    seen = weight > 0
+    ratio = dr.select(seen, dr.abs(total / weight), 0)
+    residuals = dr.fma(-2 * ratio, sw, ss) + dr.square(ratio) * ww
+    variance = dr.maximum(residuals, 0) / dr.square(weight) * n / (n - 1)
+    scale = dr.maximum(ratio, dr.mean(ratio))
+    squares = dr.select(seen & (scale > 0), variance / dr.square(scale), 0)
+    result = dr.sqrt(dr.mean(squares))[0]
+    return result if sums.count > 1 else None
+
+
+@contextlib.contextmanager
+def interruption() -> Iterator[list[int]]:
+    """The signals SIGINT and SIGTERM that have come; a second one raises KeyboardInterrupt.
+
+    Outside of the main thread nothing is caught: Python allows no handlers there.
+    """
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught
+        return
+
+    def catch(number, _frame):
+        if caught:
+            raise KeyboardInterrupt
+        caught.append(number)
+
+    before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_rules(spp: int | None, seconds: float | None, noise: float | None) -> Rules:
+    """The rules, checked; raises ValueError."""
+    if spp is not None and (spp != int(spp) or spp < 1):
+        raise ValueError(f"spp is a whole number from 1 on, and it is {spp}.")
+    for name, value in (("seconds", seconds), ("noise", noise)):
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name} has to be a number greater than 0, and it is {value}.")
+    return Rules(spp and int(spp), seconds, noise)
+
+
+def pass_spp_of(path: str | os.PathLike | None, resume: bool) -> int | None:
+    """Samples per pixel in a pass of the checkpoint to be resumed; None if there is none."""
+    if path is None or not resume or not os.path.lexists(path):
+        return None
+    return checkpoint.peek(path)["pass_spp"]
+
+
+# ------------------------------------------------------------------------ parts
+
+
+def open_job(job: Job) -> Still:
+    """The still that a job describes, with its scene loaded; sets the job's variant.
+
+    Raises ValueError, RuntimeError or OSError with a sentence if it cannot be rendered, or if the
+    scene is not the one with the job's hash.
+    """
+    mi.set_variant(job.variant)
+    resolver = mi.FileResolver(mi.file_resolver())
+    resolver.prepend(os.path.dirname(job.path) or ".")
+    mi.set_file_resolver(resolver)
+    files = SceneFiles(job.path, job.defines, job.properties)
+    if job.box_filter:
+        files.use_box_filter()
+    scene_hash = files.hash
+    if job.scene_hash not in (None, scene_hash):
+        raise ValueError(f'"{job.path}" or a file that it names differs from the one expected.')
+    integrator = files.integrator()
+    scene = files.scene(merge="shape" not in integrator.layers)
+    return Still(scene, job.sensor, integrator, job.seed, Rules(spp=job.spp), job.pass_spp,
+                 scene_hash)
+
+
+def render_part(job: Job, first: int, stop: int) -> bytes:
+    """Passes ``first`` to ``stop`` − 1 of a job, as the contents of a checkpoint file.
+
+    The scene of the last job stays loaded in this process.
+    """
+    if _opened.get("job") != job:
+        _opened.clear()
+        _opened.update(still=open_job(job), job=job)
+    still = _opened["still"]
+    state = still.nothing()
+    for index in range(first, stop):
+        state = state.plus(still.render(index))
+    return state.to_bytes()
+
+
+_opened: dict = {}
+
+
+def merge(states: Iterable[Checkpoint]) -> Checkpoint:
+    """Parts of one still put together; raises ValueError if they are not, or overlap."""
+    states = iter(states)
+    together = next(states)
+    for state in states:
+        together = together.plus(state)
+    return together
+
+
+def missing(state: Checkpoint) -> list[tuple[int, int]]:
+    """Ranges of passes that are not in a still whose ``about`` says how many there should be."""
+    gaps, index = [], 0
+    count = state.about.get("count") or (state.sums.passes[-1][1] if state.sums.passes else 0)
+    for first, stop in (*state.sums.passes, (count, count)):
+        if index < min(first, count):
+            gaps.append((index, min(first, count)))
+        index = max(index, stop)
+    return gaps
+
+
+# --------------------------------------------------------------------- pictures
+
+
+@dataclass
+class Picture:
+    """A developed still: names and tensor of the picture, layers by name, its component format."""
+
+    names: list[str]
+    image: mi.TensorXf
+    layers: dict[str, mi.TensorXf]
+    component_format: str
+
+
+def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
+    """The picture and the layers of a still, developed by ``film`` or by one like its own."""
+    from .passes import LAYERS, develop
+
+    settings = state.settings
+    if film is None:
+        film = film_of(settings["film"])
+    image = develop(film, settings["layers"], state.sums, settings["pass_spp"])
+    layers = settings["layers"]
+    names = list(settings["film"]["pixel_format"].upper())
+    if not names:  # a film with channels of its own
+        total = sum(len(LAYERS[layer]) for layer in layers)
+        names = [field.name for field in film.bitmap().struct_()][:image.shape[2] - total]
+    planes, at = {}, len(names)
+    for layer in layers:
+        planes[layer] = image[:, :, at:at + len(LAYERS[layer])]
+        at += len(LAYERS[layer])
+    return Picture(names, image[:, :, :len(names)], planes, settings["film"]["component_format"])
+
+
+def film_settings(film: mi.Film) -> dict:
+    """What it takes to make a film like this one, in plain values."""
+    match = re.search(r"pixel_format = (\w+)", str(film))
+    pixel_format = match[1] if match else ""
+    return {
+        "type": film.class_name(),
+        "size": list(map(int, film.size())),
+        "crop_size": list(map(int, film.crop_size())),
+        "crop_offset": list(map(int, film.crop_offset())),
+        "filter": str(film.rfilter()),
+        "pixel_format": pixel_format,
+        "component_format": component_format(film),
+    }
+
+
+def film_of(settings: dict) -> mi.Film:
+    """A film that develops what one with these settings has summed up; raises ValueError."""
+    if settings["type"] != "HDRFilm":
+        raise ValueError(f'parts of the film "{settings["type"]}" cannot be merged: use hdrfilm.')
+    return mi.load_dict({
+        "type": "hdrfilm",
+        "width": settings["size"][0],
+        "height": settings["size"][1],
+        "crop_width": settings["crop_size"][0],
+        "crop_height": settings["crop_size"][1],
+        "crop_offset_x": settings["crop_offset"][0],
+        "crop_offset_y": settings["crop_offset"][1],
+        "pixel_format": PIXEL_FORMATS.get(settings["pixel_format"], settings["pixel_format"]),
+        "component_format": settings["component_format"],
+    })
+
+
+def hash_of_scene(scene: mi.Scene) -> str:
+    """SHA-256 of a loaded scene: of its description and of all arrays that it lets one see."""
+    digest = hashlib.sha256(str(scene).encode())
+    parameters = mi.traverse(scene)
+    for key in sorted(parameters.keys()):
+        value = parameters[key]
+        digest.update(key.encode())
+        if dr.is_array_v(value) and dr.width(value):
+            digest.update(dr.ravel(value).memview())
+        else:
+            digest.update(str(value).encode())
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of what renders."""
+    return {"nil_mitsuba": __version__, "Mitsuba": mi.__version__, "Dr.Jit": dr.__version__}
+
+
+def _plain(value):
+    """A parameter as JSON gives it back."""
+    if isinstance(value, float) and math.isinf(value):
+        return "unlimited"
+    return value if isinstance(value, (bool, int, float, str)) else list(map(float, value))
