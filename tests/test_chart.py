@@ -1,0 +1,183 @@
+"""The other methods of tracing, what measures them, and the chart that compares them."""
+
+import json
+import math
+import sys
+
+import drjit as dr
+import pytest
+from drjit.llvm import Array3f, Array3f64, Float, Float64
+
+import truth
+from conftest import ROOT
+
+sys.path.append(str(ROOT / "examples"))
+
+
+@pytest.fixture
+def methods(rgb):
+    """The module of the other methods, which is imported when a variant is set."""
+    import tracing_methods
+    return tracing_methods
+
+
+@pytest.fixture
+def chart(rgb):
+    """The script that draws the chart."""
+    import accuracy_vs_speed
+    return accuracy_vs_speed
+
+
+# ---------------------------------------------------------------------------
+#  End points
+# ---------------------------------------------------------------------------
+
+def test_fixed_steps_converge_at_their_order(methods, chart):
+    """Halving the step divides the error by 2 (Euler) and by 16 (Runge–Kutta 4)."""
+    p, v = chart.random_starts(1000, Float64)
+    exact = truth.flow(p, v, Float64(2), Float64(1))[0]
+
+    def error(method, steps):
+        method = method(2 / steps, 1)
+        state = method.start(p, v)
+        for _ in range(steps):
+            state, h, good = method.step(state, dr.inf)
+        assert dr.all(good)
+        return dr.mean(dr.norm(state["p"] - exact))[0]
+
+    for method, order in ((methods.Euler, 1), (methods.RungeKutta4, 4)):
+        observed = math.log2(error(method, 32) / error(method, 64))
+        # The next term of the error is 1/32 of this one
+        assert abs(observed - order) < 0.15
+
+
+def test_the_error_of_an_adaptive_pair_follows_its_tolerance(chart):
+    p, v = chart.random_starts(1000, Float64)
+    exact = truth.flow(p, v, Float64(2), Float64(1))[0]
+    for tolerance in (1e-4, 1e-7, 1e-10):
+        ends = chart.adaptive_steps(p, v, 2.0, tolerance)
+        error = dr.mean(dr.norm(ends - exact))[0]
+        # A few steps of a fifth-order pair whose fourth-order error is held at the tolerance
+        assert 1e-3 * tolerance < error < 10 * tolerance
+
+
+def test_both_closed_forms_are_exact_but_the_printed_one_fails_where_w_vanishes(methods, chart):
+    p, v = chart.random_starts(1000, Float64)
+    exact, turned = truth.flow(p, v, Float64(5), Float64(1))
+    for formula in (methods.printed_flow, chart.geometry.flow):
+        ends, arrival = formula(p, v, Float64(5), 1)
+        inclined = dr.abs(v.z) > 0.01
+        error = dr.select(inclined, dr.norm(ends - exact) + dr.norm(arrival - turned), 0)
+        # 1/w² of a rounding
+        assert dr.max(error)[0] < 1e-9
+
+    for w in (0.0, 1e-5):
+        start, v = Array3f(0.2, 0.3, 0.4), Array3f(0.6, 0.8, w)
+        exact = truth.flow(Array3f64(start), Array3f64(v), Float64(5), Float64(1))[0]
+        printed, _ = methods.printed_flow(start, v, Float(5), 1)
+        stable, _ = chart.geometry.flow(start, v, Float(5), 1)
+        assert not dr.norm(Array3f64(printed) - exact)[0] < 0.1
+        assert dr.norm(Array3f64(stable) - exact)[0] < 1e-5
+
+
+def test_accelerations_come_from_the_christoffel_symbols(methods):
+    """They are what keeps a float64 geodesic's coordinates on their second differences."""
+    p, v, k, h = Array3f64(0.7, -0.2, 0.4), Array3f64(0.48, 0.64, 0.6), Float64(2), 1e-3
+    ahead, behind = (truth.flow(p, v, Float64(t), k)[0] for t in (h, -h))
+    velocity = truth.coordinate_velocity(p, v, k)
+    second = (ahead - 2 * p + behind) / h**2
+    assert dr.norm(methods.geodesic_acceleration(p, velocity, k) - second)[0] < 1e-5
+
+
+# ---------------------------------------------------------------------------
+#  First hits
+# ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_chords_converge_to_the_true_hits(chart, place):
+    """A third of the step makes a ninth of the error where the ends of chords are exact."""
+    rays = chart.Rays(chart.setups()[place], 48)
+    selection = chart.Selection(rays, rays.indices(5, 48**2), 5)
+    factors = {"Euler pieces": (2, 4.5), "Runge–Kutta 4": (6, 13), "stable form": (6, 13),
+               "printed form": (6, 13)}
+    for method, (least, most) in factors.items():
+        coarse, fine = (chart.errors(chart.tracer_of(method, step, rays.scene, rays.space),
+                                     selection, 1) for step in (0.06, 0.02))
+        assert least < coarse["position"] / fine["position"] < most
+        assert fine["direction"] < coarse["direction"] / 2
+        assert fine["other surface"] < coarse["other surface"]
+        assert fine["not a number"] == 0
+    loose, tight = (chart.errors(chart.tracer_of("Dormand–Prince", knob, rays.scene, rays.space),
+                                 selection, 1) for knob in (1e-3, 1e-4))
+    assert 5 < loose["position"] / tight["position"] < 20
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_the_package_finds_the_true_hits_of_every_scene_of_the_chart(chart, place):
+    rays = chart.Rays(chart.setups()[place], 48)
+    selection = chart.Selection(rays, rays.indices(5, 48**2), 5)
+    tracer = chart.tracer_of(chart.PACKAGE, chart.DEFAULT, rays.scene, rays.space)
+    row = chart.errors(tracer, selection, chart.DEFAULT)
+    assert row["hits"] > 0.1 * row["rays"]
+    # A convex mirror magnifies, most of all what it meets at a grazing angle
+    mirrored = rays.setup.mirror is not None
+    assert row["position"] < (1e-5 if mirrored else 1e-6)
+    assert row["position 99 %"] < (1e-3 if mirrored else 1e-5)
+    assert row["other surface"] < 3e-3
+    assert chart.chords_per_ray(tracer, selection, chart.DEFAULT) > 2
+
+
+# ---------------------------------------------------------------------------
+#  Image difference
+# ---------------------------------------------------------------------------
+
+def colours(mi, shift):
+    """An image of 64 × 48 whose features and colours move with ``shift``."""
+    index = dr.arange(mi.UInt32, 64 * 48)
+    x, y = mi.Float(index % 64) / 64, mi.Float(index // 64) / 48
+    rgb = mi.Color3f(x ** (1 + shift), y + shift * 0.05 * dr.sin(40 * y),
+                     0.5 + 0.5 * dr.sin(20 * x + shift) * dr.cos(15 * y))
+    return mi.TensorXf(dr.ravel(rgb), (48, 64, 3))
+
+
+def test_flip_is_that_of_its_authors(rgb):
+    """The numbers are those of NVIDIA's package flip-evaluator 1.7 for these images."""
+    from flip import flip
+
+    difference = flip(colours(rgb, 1), colours(rgb, 0))
+    assert dr.mean(difference.array)[0] == pytest.approx(0.41084, abs=1e-4)
+    assert dr.max(difference.array)[0] == pytest.approx(0.72137, abs=1e-4)
+    assert dr.max(flip(colours(rgb, 1), colours(rgb, 1)).array)[0] < 1e-4
+
+
+def test_flip_refuses_images_of_different_sizes(rgb):
+    from flip import flip
+
+    with pytest.raises(ValueError, match=r"one size, and got \(48, 64, 3\) and \(2, 2, 3\)"):
+        flip(colours(rgb, 0), dr.zeros(rgb.TensorXf, (2, 2, 3)))
+
+
+# ---------------------------------------------------------------------------
+#  The script
+# ---------------------------------------------------------------------------
+
+def test_one_command_writes_tables_and_charts_without_numpy(fresh_python, tmp_path):
+    script = ROOT / "examples" / "accuracy_vs_speed.py"
+    done = fresh_python(
+        f"import runpy, sys; sys.argv = ['', '--quick', '-o', {str(tmp_path)!r}]\n"
+        f"sys.path.insert(0, {str(script.parent)!r})\n"
+        f"runpy.run_path({str(script)!r}, run_name='__main__')\n"
+        "print('numpy loaded:', 'numpy' in sys.modules)")
+    assert done.returncode == 0, done.stderr
+    assert "numpy loaded: False" in done.stdout
+    assert "end points at length 5" in done.stdout
+    tables = json.loads((tmp_path / "accuracy_vs_speed.json").read_text())
+    for name in ("rays", "end points", "images"):
+        assert all(len(row) == len(tables[name]["columns"]) for row in tables[name]["rows"])
+        assert len(tables[name]["rows"]) > 5
+    assert "Dormand–Prince" in (tmp_path / "accuracy_vs_speed.txt").read_text()
+    pytest.importorskip("altair")
+    pytest.importorskip("vl_convert")
+    for name in ("accuracy_vs_speed", "images_over_time"):
+        assert "</svg>" in (tmp_path / f"{name}.svg").read_text()
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
