@@ -67,8 +67,8 @@ def render(still: stills.Still, job: Job, indices: Iterable[int], scheduler: str
     Without a scheduler, ``workers`` processes are started here. Yields parts as they come, in any
     order, and every few seconds without one a part that holds no pass. ``threads`` are those of
     each worker. What does not end the rendering is told to ``complain``. Raises OSError if there is
-    no such cluster, or if passes end every worker that takes them, and ValueError if no worker can
-    render them.
+    no such cluster (any more), or if passes end every worker that takes them, and ValueError if no
+    worker can render them.
     """
     if scheduler is None and threads is None:
         threads = max(1, dr.thread_count() // workers)
@@ -146,7 +146,10 @@ class Hands:
                     if data is not None:
                         yield data
         except (distributed.CancelledError, CommClosedError):
-            raise OSError("the connection to the cluster's scheduler is lost.") from None
+            raise OSError(
+                "the connection to the cluster's scheduler is lost: the same command with "
+                "--resume goes on."
+            ) from None
         finally:
             with contextlib.suppress(Exception):  # There may be no scheduler any more
                 self.client.cancel(list(self.flying), force=True)

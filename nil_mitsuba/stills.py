@@ -204,7 +204,12 @@ class Still:
                     progress(report)
                 if signals or self.rules.met(report):
                     break
-                part = next(parts, None)
+                try:
+                    part = next(parts, None)
+                except Exception:
+                    if saver is not None and state.sums.count:
+                        saver.save(state)
+                    raise
                 if part is None:
                     break
                 state = state.plus(part)

@@ -106,7 +106,7 @@ class Chords:
 
     The sagitta is at most h² g/8 with g = ``bend.across``, and h² g/8 = width + spread (t + h/2)
     is solved for h, the cone being as wide at its start as elsewhere at the distance ``start``.
-    Below ``least`` sagittas are lost in float32's rounding.
+    None is shorter than ``least``.
     """
 
     def __init__(self, bend: Bend, cone: Cone, part: mi.Float, start: mi.Float, least: mi.Float):
@@ -137,8 +137,9 @@ class Tracer:
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
-        # 1e-4 cells near the origin: a hundred times what Mitsuba's float32 arithmetic may lose
-        self.least = opaque(100 * space.slack)
+        # Shorter chords, and hits that lie closer to the geodesic, are lost in float32's rounding.
+        self.least = opaque(dr.maximum(1e-4, 16 * space.slack))
+        self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
         box = scene_box(scene)
         if not box.valid():  # a scene of environment emitters only
             box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
@@ -295,7 +296,7 @@ class Tracer:
             # A step sideways has no sagitta, but its start was off the geodesic.
             sideways = length == 0
             error = dr.select(sideways, dr.inf, bend.across * 0.125 * dr.square(scale))
-            goal = dr.fma(0.004, dr.fma(cone.spread, distance, cone.width), 4 * space.slack)
+            goal = dr.fma(0.004, dr.fma(cone.spread, distance, cone.width), self.exact)
             # A chord that cannot be cut any more is taken as it is.
             looking = there & ~cone.soft & (error > goal) & (sideways | (scale > self.least))
             # What a step sideways has met stays where the tangent there finds nothing better.
