@@ -53,12 +53,12 @@ def overhead(plain, costly, repeats):
     return statistics.median(ratios), min(ratios), max(ratios)
 
 
-def passes(repeats, samples):
-    """A still in passes of so many samples, against one pass of all."""
+def passes(repeats, total, samples):
+    """A still of so many samples in passes of fewer, against one pass of all."""
     from nil_mitsuba import passes as module
 
     scene, integrator = load(512, 256)
-    spp = 4 * module.WAVEFRONT_SAMPLES // (512 * 256)
+    spp = total // (512 * 256)
 
     def render(still):
         state = still.nothing()
@@ -122,7 +122,10 @@ def main():
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--samples", type=int, nargs="+", default=[16, 64, 256],
                         help="samples per pixel at which memory is measured")
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
     arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.repeats, arguments.samples = 1, [1]
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
 
@@ -131,9 +134,12 @@ def main():
         print(f"  {spp:5d} spp: {peak_memory(spp):.0f} MiB")
     from nil_mitsuba.passes import WAVEFRONT_SAMPLES
 
+    shrink = 16 if arguments.quick else 1
+    total = 4 * WAVEFRONT_SAMPLES // shrink
     for name, function, *of in (
-        ("passes against a single one", passes, WAVEFRONT_SAMPLES),
-        ("passes for --time and --noise against a single one", passes, stills.LOOK_SAMPLES),
+        ("passes against a single one", passes, total, WAVEFRONT_SAMPLES // shrink),
+        ("passes for --time and --noise against a single one", passes, total,
+         max(stills.LOOK_SAMPLES // shrink, 512 * 256)),
         ("all layers against none", layers),
     ):
         median, low, high = function(arguments.repeats, *of)

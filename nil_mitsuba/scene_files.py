@@ -70,20 +70,21 @@ class SceneFiles:
     def use_box_filter(self) -> None:
         """Let each pixel hold its own samples only, as denoising needs; says so in `notes`."""
         nodes, kind = self.rest.nodes, mi.ObjectType.ReconstructionFilter
-        for node in list(nodes):
-            if node.type != mi.ObjectType.Film:
+        for i in range(len(nodes)):
+            if nodes[i].type != mi.ObjectType.Film:
                 continue
-            filters = [key for key, index in self._children(node.props)
-                       if nodes[index].type == kind]
-            names = [nodes[node.props[key].index()].props.plugin_name() for key in filters]
+            props = nodes[i].props
+            filters = [key for key, index in self._children(props) if nodes[index].type == kind]
+            names = [nodes[props[key].index()].props.plugin_name() for key in filters]
             if names == ["box"]:
                 continue
             for key in filters:
-                del node.props[key]
+                del props[key]
             box = mi.parser.SceneNode()
             box.type, box.props = kind, mi.Properties("box")
+            # Before the list grows: references to its nodes do not outlive that.
+            props["rfilter"] = mi.Properties.ResolvedReference(len(nodes))
             nodes.append(box)
-            node.props["rfilter"] = mi.Properties.ResolvedReference(len(nodes) - 1)
             self.notes.append(
                 f'--denoise: the film\'s filter "{(names or ["gaussian"])[0]}" is replaced by '
                 '"box", since noise that pixels share cannot be removed.'
