@@ -1,9 +1,10 @@
 # make render: a first picture.   make test: the tests.   make verify: the long checks.
+# make lint: style and types.     make gallery: all stills.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: render test verify lint clean
+.PHONY: render test verify lint gallery clean
 
 render: $(VENV)/.installed
 	mkdir -p out
@@ -17,6 +18,10 @@ verify: $(VENV)/.installed-test
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+gallery: $(VENV)/.installed-denoise
+	$(BIN)/python examples/gallery.py
 
 clean:
 	rm -rf $(VENV) out
