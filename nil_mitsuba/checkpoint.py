@@ -9,11 +9,15 @@ import struct
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from .files import replacing
+
+if TYPE_CHECKING:  # it needs a variant
+    from .passes import Sums
 
 # The number is that of the format. JSON text follows, with its length before it, then the arrays
 # in the order in which it lists them, and the SHA-256 of all that.
@@ -34,12 +38,12 @@ class Checkpoint:
     """Sums of passes, and what it takes to add more of them.
 
     ``settings`` is what has to be equal for sums to be added up (names, texts, numbers, and lists
-    and dictionaries of them); ``sums`` a `passes.Sums`; ``seconds`` the time that rendering took;
+    and dictionaries of them); ``seconds`` the time that rendering took;
     ``about`` what a picture's metadata tell besides.
     """
 
     settings: dict
-    sums: object
+    sums: Sums
     seconds: float = 0.0
     about: dict = field(default_factory=dict)
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import math
+import os
 import re
 import shlex
+import signal
+import stat
 import sys
 import tempfile
 import time
@@ -16,7 +20,7 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, checkpoint, exr, stills
+from . import __version__, checkpoint, exr, png, stills
 from .output import GUIDES, Output, metadata_of, software
 from .registration import refusal
 from .scene_files import Job, SceneFiles, fitted_cell
@@ -46,14 +50,27 @@ class Duration(click.ParamType):
         if isinstance(value, float):
             return value
         number = r"(\d+\.?\d*|\.\d+)"
-        match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s?)?", value.strip())
+        text = value.strip()
+        if re.fullmatch(number, text):
+            text += "s"
+        match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?", text)
         seconds = match and sum(
-            float(text) * unit for text, unit in zip(match.groups(), self.UNITS.values()) if text
+            float(part) * unit for part, unit in zip(match.groups(), self.UNITS.values()) if part
         )
         if not seconds:
             self.fail(f'expected a time such as 90s, 30m or 1h30m, and "{value}" is none.', param,
                       ctx)
         return seconds
+
+
+class Range(click.FloatRange):
+    """A number in a range, which not-a-number is not."""
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if number != number:
+            self.fail(f'expected a number, and "{value}" is none.', param, ctx)
+        return number
 
 
 class PassRange(click.ParamType):
@@ -86,8 +103,9 @@ def picture_options(command):
     """The options on how a picture is written."""
     for option in reversed((
         click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too."),
-        click.option("--exposure", type=click.FloatRange(-100, 100), default=0.0,
-                     metavar="STOPS", help="Brighten the PNG picture by so many stops."),
+        click.option("--exposure", type=Range(-png.MAX_EXPOSURE, png.MAX_EXPOSURE),
+                     default=0.0, metavar="STOPS",
+                     help="Brighten the PNG picture by so many stops."),
         click.option("--filmic", is_flag=True,
                      help="Let the PNG picture's highlights fade out as film does."),
         click.option("--denoise", is_flag=True,
@@ -110,8 +128,12 @@ def picture_options(command):
 @click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's, "
               "or with --time or --noise no limit]")
 @click.option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
-@click.option("--noise", type=click.FloatRange(0, min_open=True), metavar="ERROR",
-              help="Stop at this relative error, such as 0.02.")
+@click.option("--noise", type=Range(0, min_open=True), metavar="ERROR",
+              help="Stop at this relative error, such as 0.02; pixels that are infinite or not a "
+              "number are left out.")
+@click.option("--pass-spp", type=click.IntRange(1), help="Samples per pixel in each pass. This "
+              "and --spp, as a file tells them, render its picture again.  [default: by size and "
+              "rules]")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @click.option("--checkpoint", metavar="FILE" + SUMS, help="Keep the samples in this file, when the "
               "picture is done, too.  [default: one beside the picture until it is done]")
@@ -162,7 +184,7 @@ def render(scene, define, properties, layers, fit, sensor, mode, threads, verbos
         # Its properties, hash and samples per pass are known later
         job = Job(str(scene_path.absolute()), mode, dict(define), {}, sensor, options["seed"],
                   rules.spp, box_filter=options["denoise"])
-    options["worker_threads"] = threads
+    options |= {"worker_threads": threads, "layers": layers}
 
     _set_variant(mode, verbose)
     if options["denoise"]:
@@ -231,21 +253,30 @@ def merge(parts, output, **options):
         raise click.UsageError(f"--png and --denoise go with a picture, not with {SUMS}.")
     exr_path = _output_path(output, SUMS if sums_only else ".exr", "-o")
     png_path = _output_path(options["png"], ".png", "--png") if options["png"] else None
+    if sums_only and exr_path.exists() and not any(map(exr_path.samefile, parts)):
+        raise click.ClickException(
+            f'"{exr_path}" holds samples and is none of the parts: remove it, or name another file.'
+        )
 
     _set_variant(checkpoint.peek(parts[0])["variant"], 0)
     state = checkpoint.load(parts[0])
+    commands = [state.about.get("commandLine")]
     for part in parts[1:]:
         try:
-            state = state.plus(checkpoint.load(part))
+            further = checkpoint.load(part)
+            state = state.plus(further)
         except ValueError as error:
             raise click.ClickException(
                 f'cannot merge "{part}" with "{parts[0]}": {error}'
             ) from None
+        commands.append(further.about.get("commandLine"))
     missing = stills.missing(state)
     if missing:
         _note(f"the passes {checkpoint.name_passes(missing)} of 0:{state.about['count']} are "
               "missing.")
-    state.about["commandLine"] = shlex.join(["nil-mitsuba", *sys.argv[1:]])
+    # All that it took, line by line as in a script
+    commands.append(shlex.join(["nil-mitsuba", *sys.argv[1:]]))
+    state.about["commandLine"] = "\n".join(dict.fromkeys(filter(None, commands)))
     if sums_only:
         checkpoint.save(exr_path, state)
     else:
@@ -309,10 +340,16 @@ def _still(scene, integrator, sensor, scene_hash, rules, sums_path, note, option
     if options["resume"] and not sums_path.exists():
         note(f'there is no checkpoint "{sums_path}": beginning with the first pass.')
     still = stills.Still(scene, sensor, integrator, options["seed"], rules,
-                         stills.pass_spp_of(sums_path, options["resume"]), scene_hash)
+                         options["pass_spp"] or stills.pass_spp_of(sums_path, options["resume"]),
+                         scene_hash)
     if options["denoise"]:
         _require_guides(still.settings)
+    if options["png"] and not still.settings["film"]["pixel_format"]:
+        raise click.ClickException(
+            f'--png needs a film with colours, and "{still.settings["film"]["type"]}" has none.'
+        )
     if options["passes"]:
+        stills.film_of(still.settings["film"])  # what "merge" will need
         first, stop = options["passes"]
         if stop > still.count:
             raise click.ClickException(
@@ -330,9 +367,11 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
     """
     sums_path, count = paths["sums"], still.count
     first, stop = options["passes"] or (0, count)
-    if options["passes"]:
-        still.rules = stills.Rules(spp=(stop - first) * still.passes.spp)
     state = still.start(sums_path, options["resume"])
+    if options["passes"]:
+        # Passes that are there already may be others
+        wanted = state.sums.count + len(list(still.todo(state, first, stop)))
+        still.rules = stills.Rules(spp=wanted * still.passes.spp)
     state.about = about | ({"count": count} if count else {})
 
     parts = (still.render(index) for index in still.todo(state, first, stop))
@@ -348,24 +387,26 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
     if not state.sums.count:
         raise Stopped("interrupted before the first pass, nothing was written.", number)
 
-    kept = False
-    if number or options["checkpoint"] or options["passes"]:
+    # Whatever ends the writing of the picture, its samples are there
+    with stills.interruption() as signals:
         kept = saver.save(state)
+    number = next(iter(signals), number)
     if options["passes"]:
         written = [sums_path] if kept else []
     else:
         written = list(filter(None, (paths["exr"], paths["png"])))
+        there = (f'The samples are in "{sums_path}": the same command with --resume writes the '
+                 "picture." if kept else "The samples could not be saved.")
         try:
-            _output(paths, options, layers).write(
-                stills.picture_of(state, still.film), metadata_of(state)
-            )
-        except OSError as error:
-            if not (kept or saver.save(state)):
-                raise
-            raise click.ClickException(
-                f'{error} The samples are in "{sums_path}": the same command with --resume writes '
-                "the picture."
-            ) from None
+            with stills.interruption(patience=0) as signals:
+                _output(paths, options, layers).write(
+                    stills.picture_of(state, still.film), metadata_of(state)
+                )
+        except KeyboardInterrupt:
+            raise Stopped(f"interrupted before the picture was written. {there}",
+                          next(iter(signals), signal.SIGINT)) from None
+        except Exception as error:
+            raise click.ClickException(f"{tidy(str(error))} {there}") from error
     for path in written:
         click.echo(path)
     if number:
@@ -383,9 +424,10 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
 
 def _render_in_one_go(scene, integrator, sensor, scene_hash, about, paths, options) -> None:
     """Render with a wrapper of Mitsuba's around "nil", which knows no passes."""
-    given = [name for name in ("noise", "time", "resume", "passes", "checkpoint", "denoise",
-                               "scheduler", "workers")
-             if options["seconds" if name == "time" else name]]
+    names = {"noise": "noise", "time": "seconds", "resume": "resume", "passes": "passes",
+             "pass-spp": "pass_spp", "checkpoint": "checkpoint", "denoise": "denoise",
+             "layers": "layers", "scheduler": "scheduler", "workers": "workers"}
+    given = [name for name, key in names.items() if options[key]]
     if given:
         raise click.ClickException(
             f"--{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
@@ -440,10 +482,11 @@ class _Bar:
             words.append(f"noise {progress.noise:.2g}")
         whole = progress.seconds + left if left is not None else 0
         self.bar.n = min(1.0, progress.seconds / whole) if whole else 0.0
-        self.bar.set_postfix_str(", ".join(words), refresh=True)
+        with contextlib.suppress(OSError):  # a terminal that is gone ends no render
+            self.bar.set_postfix_str(", ".join(words), refresh=True)
 
     def _clock(self, seconds: float) -> str:
-        return self.bar.format_interval(seconds)
+        return self.bar.format_interval(seconds) if seconds < math.inf else "?"
 
 
 # ----------------------------------------------------------------------- output
@@ -495,16 +538,29 @@ def _require_guides(settings: dict) -> None:
 
 
 def _output_path(name: str | Path, suffix: str, option: str) -> Path:
-    """Path of a file to write, whose folder is writable and whose suffix says what it holds."""
+    """Path of a file that can be written, whose suffix says what it holds."""
     path = Path(name)
     if not path.suffix:
         path = path.with_suffix(suffix)
     if path.suffix.lower() != suffix:
         raise click.UsageError(f'{option} writes a {suffix} file, and "{path}" is named otherwise.')
-    if path.is_dir():
-        raise click.ClickException(f'cannot write "{path}": it is a folder.')
+    real = Path(os.path.realpath(path))  # what a link points at
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
+        str(real).encode()
+    except UnicodeEncodeError:
+        raise click.ClickException(
+            f'cannot write "{click.format_filename(path)}": its name is not text in UTF-8.'
+        ) from None
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            mode = os.stat(real).st_mode
+            if not stat.S_ISREG(mode):
+                what = "a folder" if stat.S_ISDIR(mode) else "not an ordinary file"
+                raise click.ClickException(f'cannot write "{path}": it is {what}.')
+    except OSError as error:  # such as a name that is too long
+        raise click.ClickException(f'cannot write "{path}": {error.strerror}.') from None
+    try:
+        with tempfile.TemporaryFile(dir=real.parent):
             pass
     except OSError as error:
         raise click.ClickException(

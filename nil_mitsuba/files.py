@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+STEM_LENGTH = 40  # characters; 160 bytes in UTF-8 at most, and file systems allow names of 255
+
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[str]:
@@ -20,7 +22,8 @@ def replacing(path: str | os.PathLike) -> Iterator[str]:
     if target.exists() and not target.is_file():
         what = "a folder" if target.is_dir() else "not an ordinary file"
         raise OSError(f'cannot write "{path}": it is {what}.')
-    part = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    # Part of the name is enough, since a longer one might be too long
+    part = target.with_name(f".{target.stem[:STEM_LENGTH]}.{os.getpid()}{target.suffix}")
     try:
         part.touch()  # some writers cannot tell why they fail to open a file
         yield str(part)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import numbers
+import operator
 import os
 import re
 import signal
@@ -17,6 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +28,9 @@ from . import __version__, checkpoint
 from .checkpoint import Checkpoint
 from .exr import component_format
 from .scene_files import Job, SceneFiles
+
+if TYPE_CHECKING:  # it needs a variant
+    from .passes import Sums
 
 # A checkpoint is never older than this, as long as no single pass and no writing takes longer.
 CHECKPOINT_SECONDS = 60.0
@@ -50,7 +56,7 @@ PIXEL_FORMATS = {"y": "luminance", "ya": "luminance_alpha"}
 class Rules:
     """When to stop: samples per pixel, seconds of rendering, noise (see ``noise``).
 
-    Whichever comes first counts; at least one of them has to be given.
+    Whichever comes first counts, once there is a pass; at least one of them has to be given.
     """
 
     spp: int | None = None
@@ -58,7 +64,7 @@ class Rules:
     noise: float | None = None
 
     def met(self, progress: Progress) -> bool:
-        return (
+        return progress.passes > 0 and (
             (self.spp is not None and progress.samples >= self.spp)
             or (self.seconds is not None and progress.seconds >= self.seconds)
             or (self.noise is not None and progress.noise is not None
@@ -88,7 +94,8 @@ class Progress:
                 estimates.append(self.seconds * (rules.spp / self.samples - 1))
             if rules.noise is not None and self.noise is not None:
                 # Noise falls with the square root of the number of samples
-                estimates.append(self.seconds * ((self.noise / rules.noise) ** 2 - 1))
+                ratio = self.noise / rules.noise
+                estimates.append(self.seconds * (ratio * ratio - 1))
         return max(0.0, min(estimates)) if estimates else None
 
 
@@ -117,6 +124,14 @@ class Still:
             raise ValueError(
                 f'the integrator "{type(integrator).__name__}" renders in one go: only "nil" '
                 "itself, with no other integrator around it, renders in passes."
+            )
+        seed, sensor = operator.index(seed), operator.index(sensor)  # they may be NumPy's
+        if not 0 <= seed < 2**32:
+            raise ValueError(f"seed is a whole number from 0 to 2^32 - 1, and it is {seed}.")
+        if not 0 <= sensor < len(scene.sensors()):
+            raise ValueError(
+                f"the scene has {len(scene.sensors())} sensors, numbered from 0, and sensor is "
+                f"{sensor}."
             )
         sensor_number, sensor = sensor, scene.sensors()[sensor]
         self.film = sensor.film()
@@ -200,14 +215,15 @@ class Still:
                 state.seconds = before + time.perf_counter() - start
                 report = Progress(state.sums.count, state.sums.count * self.passes.spp,
                                   state.seconds, noise(self.film, state.sums), self.rules)
-                if progress is not None:
-                    progress(report)
-                if signals or self.rules.met(report):
-                    break
                 try:
+                    if progress is not None:
+                        progress(report)
+                    if signals or self.rules.met(report):
+                        break
                     part = next(parts, None)
-                except Exception:
-                    if saver is not None and state.sums.count:
+                except BaseException:
+                    # A second signal does not wait, an exception of the callback's does
+                    if saver is not None and state.sums.count and len(signals) < 2:
                         saver.save(state)
                     raise
                 if part is None:
@@ -306,12 +322,14 @@ def render(
     return image
 
 
-def noise(film: mi.Film, sums) -> float | None:
+def noise(film: mi.Film, sums: Sums) -> float | None:
     """Estimated relative error of an image, from what its passes differ by; None below two passes.
 
     It is the root mean square, over all pixels, of the standard error of a pixel's luminance,
     divided by that luminance or by the mean luminance of the image, whichever is larger. A single
-    pixel counts 1 at most, so that a few bright specks do not hide how far the rest is.
+    pixel counts 1 at most, so that a few bright specks do not hide how far the rest is. Pixels
+    that are infinite or not a number, which no further samples mend, are left out; the error of an
+    image that has no others is infinite.
 
     A pixel's luminance is the ratio R = ΣS/ΣW of sums over n passes; the variance of such a ratio
     is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13).
@@ -323,19 +341,22 @@ def noise(film: mi.Film, sums) -> float | None:
     ss, sw, ww = (dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels)
                             + i * pixels) for i in range(3))
     n = dr.opaque(mi.Float64, sums.count)
-    seen = weight > 0
+    finite = dr.isfinite(total) & dr.isfinite(ss) & dr.isfinite(weight)
+    seen = (weight > 0) & finite
     ratio = dr.select(seen, dr.abs(total / weight), 0)
+    count = dr.maximum(dr.count(finite), 1)
     residuals = dr.fma(-2 * ratio, sw, ss) + dr.square(ratio) * ww
     variance = dr.maximum(residuals, 0) / dr.square(weight) * n / (n - 1)
-    scale = dr.maximum(ratio, dr.mean(ratio))
+    scale = dr.maximum(ratio, dr.sum(ratio) / count)
     squares = dr.select(seen & (scale > 0), variance / dr.square(scale), 0)
-    result = dr.sqrt(dr.mean(squares))[0]
+    result = dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
     return result if sums.count > 1 else None
 
 
 @contextlib.contextmanager
-def interruption() -> Iterator[list[int]]:
-    """The signals SIGINT and SIGTERM that have come; a second one raises KeyboardInterrupt.
+def interruption(patience: int = 1) -> Iterator[list[int]]:
+    """The signals SIGINT and SIGTERM that have come; one beyond `patience` of them raises
+    KeyboardInterrupt.
 
     Outside of the main thread nothing is caught: Python allows no handlers there.
     """
@@ -345,9 +366,9 @@ def interruption() -> Iterator[list[int]]:
         return
 
     def catch(number, _frame):
-        if caught:
-            raise KeyboardInterrupt
         caught.append(number)
+        if len(caught) > patience:
+            raise KeyboardInterrupt
 
     before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -359,7 +380,10 @@ def interruption() -> Iterator[list[int]]:
 
 def check_rules(spp: int | None, seconds: float | None, noise: float | None) -> Rules:
     """The rules, checked; raises ValueError."""
-    if spp is not None and (spp != int(spp) or spp < 1):
+    for name, value in (("spp", spp), ("seconds", seconds), ("noise", noise)):
+        if value is not None and not isinstance(value, numbers.Real):
+            raise ValueError(f"{name} has to be a number, and it is {value!r}.")
+    if spp is not None and not (1 <= spp < math.inf and spp == int(spp)):
         raise ValueError(f"spp is a whole number from 1 on, and it is {spp}.")
     for name, value in (("seconds", seconds), ("noise", noise)):
         if value is not None and not 0 < value < math.inf:
@@ -473,7 +497,8 @@ def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
 def film_settings(film: mi.Film) -> dict:
     """What it takes to make a film like this one, in plain values."""
     match = re.search(r"pixel_format = (\w+)", str(film))
-    pixel_format = match[1] if match else ""
+    special = mi.has_flag(film.flags(), mi.FilmFlags.Special)  # with channels of its own
+    pixel_format = match[1] if match and not special else ""
     return {
         "type": film.class_name(),
         "size": list(map(int, film.size())),
@@ -503,8 +528,13 @@ def film_of(settings: dict) -> mi.Film:
 
 
 def hash_of_scene(scene: mi.Scene) -> str:
-    """SHA-256 of a loaded scene: of its description and of all arrays that it lets one see."""
-    digest = hashlib.sha256(str(scene).encode())
+    """SHA-256 of a loaded scene: of its description and of all arrays that it lets one see.
+
+    Numbers of samples are no part of it: each render in between sets them.
+    """
+    text = re.sub(r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+", "",
+                  str(scene))
+    digest = hashlib.sha256(text.encode())
     parameters = mi.traverse(scene)
     for key in sorted(parameters.keys()):
         value = parameters[key]

@@ -209,8 +209,9 @@ class Tracer:
                   active: mi.Bool, time: mi.Float = 0) -> Hit:
         """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` within ``reach``.
 
-        In the quotient ``p`` lies in the unit cube. The result's distance errs across the
-        geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more.
+        In the quotient ``p`` lies in the unit cube. A hit lies off the geodesic by at most 1e-5
+        cells or 1/250 of the cone, whichever is more; by the chord's own error, which keeps within
+        the cone, where the geodesic itself only just misses what its chord meets.
         """
         space, scene = self.space, self.scene
         k = space.twist

