@@ -77,7 +77,7 @@ class Checkpoint:
             kind = ARRAYS[key]
             flat, tensor = {"d": (mi.Float64, mi.TensorXd), "i": (mi.Int32, mi.TensorXi)}[kind]
             stop = start + struct.calcsize(kind) * _product(shape)
-            items = memoryview(data)[start:stop].cast(kind)
+            items = memoryview(data)[start:stop].cast(kind)  # type: ignore[call-overload]
             # A copy, in memory as sums in the making are: the same kernels go on with it
             values = dr.zeros(flat, 0) if 0 in shape else flat(items) + dr.opaque(flat, 0)
             arrays[key] = tensor(values, tuple(shape))

@@ -385,7 +385,7 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
     with contextlib.closing(parts), _Bar(still, options["quiet"]) as bar:
         state, number = still.accumulate(state, parts, bar, saver)
     if not state.sums.count:
-        raise Stopped("interrupted before the first pass, nothing was written.", number)
+        raise Stopped("interrupted before the first pass, nothing was written.", number or 0)
 
     # Whatever ends the writing of the picture, its samples are there
     with stills.interruption() as signals:
@@ -443,8 +443,8 @@ def _render_in_one_go(scene, integrator, sensor, scene_hash, about, paths, optio
         "renderTime": time.perf_counter() - start, "variant": mi.variant(),
         "software": software(stills.versions()),
     }
-    names = [field.name for field in film.bitmap().struct_()]
-    picture = stills.Picture(names, image, {}, exr.component_format(film))
+    channels = [field.name for field in film.bitmap().struct_()]
+    picture = stills.Picture(channels, image, {}, exr.component_format(film))
     _output(paths, options, ()).write(picture, metadata)
     for path in filter(None, (paths["exr"], paths["png"])):
         click.echo(path)

@@ -8,7 +8,7 @@ import platform
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
@@ -61,7 +61,7 @@ class Refused(Exception):
 
 def render(still: stills.Still, job: Job, indices: Iterable[int], scheduler: str | None = None,
            workers: int = 1, threads: int | None = None,
-           complain: Callable[[str], None] = print) -> Iterator[Checkpoint]:
+           complain: Callable[[str], None] = print) -> Generator[Checkpoint, None, None]:
     """Passes of `still`, which `job` describes, rendered by the cluster at ``scheduler``.
 
     Without a scheduler, ``workers`` processes are started here. Yields parts as they come, in any
@@ -96,6 +96,8 @@ class Queue:
         """The next range, of up to `most` passes, or one that has been put back."""
         if self.again:
             return self.again.pop(0)
+        if self.next is None:
+            raise IndexError("there are no passes left")
         first = stop = self.next
         while stop == self.next and stop - first < most:
             stop += 1
@@ -130,7 +132,7 @@ class Hands:
         self.seconds: float | None = None    # Of a pass, once one has come
         self.waiting = False
 
-    def parts(self) -> Iterator[bytes | None]:
+    def parts(self) -> Generator[bytes | None, None, None]:
         """Contents of parts as they come; None if nothing has come for a while."""
         try:
             while True:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 MAGIC = b"\x76\x2f\x31\x01"
 MULTIPART = 1 << 12  # bit of the version field
@@ -40,7 +40,7 @@ class Attribute(NamedTuple):
     is unknown; a "chlist" is a dict of channels' names and pixel types."""
 
     type: str
-    value: object
+    value: Any
 
 
 def read(path: str | os.PathLike) -> list[dict[str, Attribute]]:

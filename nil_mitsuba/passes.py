@@ -240,7 +240,7 @@ def luminance(film: mi.Film, values: mi.TensorXf | mi.TensorXd) -> tuple[mi.Floa
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         # Bands of its own, none more important than another; the last channel is the weight
         weight = channels - 1
-        colours = [1 / weight] * weight
+        colours: tuple[float, ...] = (1 / weight,) * weight
     else:
         weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
         colours = LUMINANCE

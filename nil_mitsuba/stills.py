@@ -14,6 +14,7 @@ import operator
 import os
 import re
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -133,8 +134,7 @@ class Still:
                 f"the scene has {len(scene.sensors())} sensors, numbered from 0, and sensor is "
                 f"{sensor}."
             )
-        sensor_number, sensor = sensor, scene.sensors()[sensor]
-        self.film = sensor.film()
+        self.film = scene.sensors()[sensor].film()
         if pass_spp is None and (rules.seconds or rules.noise):
             pass_spp = max(1, LOOK_SAMPLES // dr.prod(self.film.crop_size()))
             pass_spp = min(pass_spp, rules.spp or pass_spp)
@@ -144,7 +144,7 @@ class Still:
         self.rules = rules
         self.settings = {
             "scene": scene_hash or hash_of_scene(scene),
-            "sensor": sensor_number,
+            "sensor": sensor,
             "seed": seed,
             "pass_spp": self.passes.spp,
             "sampler": self.passes.sampler.class_name(),
@@ -193,8 +193,9 @@ class Still:
     def todo(self, state: Checkpoint, first: int = 0, stop: int | None = None) -> Iterator[int]:
         """Numbers of the passes from ``first`` on, up to ``stop``, that are not in ``state``."""
         index = first
-        for present, end in (*state.sums.passes, (math.inf, math.inf)):
-            while index < min(present, math.inf if stop is None else stop):
+        endless = sys.maxsize
+        for present, end in (*state.sums.passes, (endless, endless)):
+            while index < min(present, endless if stop is None else stop):
                 yield index
                 index += 1
             index = max(index, end)
