@@ -83,8 +83,10 @@ def assert_same_expectation(first: Estimate, second: Estimate, block: int | None
     rows, columns = first.shape
     limit = sidak(rows * columns)
     for z in z_scores(first, second, block=1):
-        share = dr.count(dr.abs(z) <= limit)[0] / (rows * columns)
-        assert share >= PASSING, f"{share:.4%} of the pixels pass the Z-test"
+        failing = rows * columns - dr.count(dr.abs(z) <= limit)[0]  # NaN fails, too
+        # One in 100 sound images of any size has one such pixel, one in 20,000 has two
+        allowed = max(1, (1 - PASSING) * rows * columns)
+        assert failing <= allowed, f"{failing} of {rows * columns} pixels fail the Z-test"
 
     if block is not None:
         scores = z_scores(first, second, block)
