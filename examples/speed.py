@@ -7,6 +7,7 @@ import argparse
 import math
 import resource
 import time
+from statistics import NormalDist
 
 import drjit as dr
 import mitsuba as mi
@@ -66,6 +67,25 @@ def against_path(width, spp, rounds):
         error = math.sqrt(sum((m - mean) ** 2 for m in means[name]) / max(1, rounds - 1) / rounds)
         print(f"{name:30} {ratios[len(ratios) // 2]:6.2f} times path   "
               f"mean {mean:.5f} ± {error:.5f}")
+
+
+def pixels_off(width, spp):
+    """Count pixels that differ by more than noise from those at a sixteenth of the tolerance."""
+    mi.set_log_level(mi.LogLevel.Error)  # `moment` is fine around nil
+    estimates = []
+    for seed, tolerance in enumerate((0.25, 0.25 / 16)):
+        scene = bent_box(width, tolerance=tolerance)
+        moment = mi.load_dict({"type": "moment", "of": scene.integrator()})
+        image = mi.render(scene, integrator=moment, spp=spp, seed=seed)
+        mean, square = (mi.Float(image[:, :, i].array) for i in (-5, -2))  # Y and its square
+        estimates.append((mean, (square - dr.square(mean)) / (spp - 1)))
+    (a, a2), (b, b2) = estimates
+    z = (a - b) * dr.rsqrt(dr.maximum(a2 + b2, 1e-12))
+    # What one sound image in 20 exceeds with its largest z
+    limit = NormalDist().inv_cdf(1 - 0.05 / 2 / width**2)
+    off = dr.count(dr.abs(z) > limit)[0]
+    print(f"pixels off at {spp} spp: {off} of {width**2} beyond |z| = {limit:.2f}; "
+          f"largest {dr.max(dr.abs(z))[0]:.2f}, rms {math.sqrt(dr.mean(z * z)[0]):.3f}")
 
 
 def bumpy_scene(triangles, **properties):
@@ -177,10 +197,12 @@ if __name__ == "__main__":
     if arguments.quick:
         memory()
         against_path(32, 16, 2)
+        pixels_off(32, 16)
         against_triangles((1_000, 10_000))
         against_straight(1_000, 4, 2)
     else:
         memory()
         against_path(128, 256, 5)
+        pixels_off(128, 256)
         against_triangles((1_000, 10_000, 100_000, 1_000_000))
         against_straight(240_000, 32, 5)
