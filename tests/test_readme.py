@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -41,7 +42,8 @@ def lines(block):
 def desk(tmp_path_factory):
     """A folder with the README's first scene and links to what its commands read."""
     folder = tmp_path_factory.mktemp("desk")
-    for name in ("scenes", "examples", "tests", "nil_mitsuba", "Makefile", "pyproject.toml",
+    shutil.copytree(ROOT / "scenes", folder / "scenes")  # pictures are written beside scenes
+    for name in ("examples", "tests", "nil_mitsuba", "Makefile", "pyproject.toml",
                  "README.md", "docs"):
         (folder / name).symlink_to(ROOT / name)
     (folder / "hello.xml").write_text(blocks("xml")[0])
