@@ -37,10 +37,9 @@ from nil_mitsuba.tracer import Cone, Tracer  # noqa: E402
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests"))
 
-from flip import flip  # noqa: E402
-from tracing_methods import METHODS, ChordTracer  # noqa: E402
-
 import truth  # noqa: E402
+from flip import flip  # noqa: E402
+from tracing_methods import METHODS, ChordTracer, adaptive_steps, fixed_steps  # noqa: E402
 from truth import Array3f64, Array3i, Cylinder, Float64, Int32, Rectangle, Sphere  # noqa: E402
 
 TWIST = 1
@@ -495,33 +494,6 @@ def random_starts(count, float_t):
     return (array_t(*(float_t(x) for x in y)) for y in (p, v))
 
 
-def fixed_steps(p, v, length, steps):
-    """End points after so many equal steps of the classical Runge–Kutta method."""
-    float_t = type(p.x)
-    method = METHODS["Runge–Kutta 4"](dr.opaque(float_t, length / steps), dr.opaque(float_t, TWIST))
-    steps = dr.opaque(dr.llvm.UInt32, steps)
-    _, state = dr.while_loop(
-        (dr.zeros(dr.llvm.UInt32, dr.width(p)), method.start(p, v)),
-        lambda i, state: i < steps, lambda i, state: (i + 1, method.step(state, dr.inf)[0]))
-    return state["p"]
-
-
-def adaptive_steps(p, v, length, tolerance):
-    """End points by the pair of Dormand and Prince, each ray with steps of its own."""
-    float_t = type(p.x)
-    method = METHODS["Dormand–Prince"](dr.opaque(float_t, tolerance), dr.opaque(float_t, TWIST),
-                                       chords=False)
-    length = dr.opaque(float_t, length)
-
-    def step(t, state):
-        state, h, good = method.step(state, length - t)
-        return dr.select(good, dr.select(h < length - t, t + h, length), t), state
-
-    _, state = dr.while_loop((dr.zeros(float_t, dr.width(p)), method.start(p, v)),
-                             lambda t, state: t < length, step)
-    return state["p"]
-
-
 def closed_form(p, v, length):
     float_t = type(p.x)
     return geometry.flow(p, v, dr.opaque(float_t, length), dr.opaque(float_t, TWIST))[0]
@@ -558,13 +530,13 @@ def end_points(lengths, rounds, quick=False):
                 steps = round(length * 2 ** (i / 2))
                 contestants.append((length, "Runge–Kutta 4", name, float_t, length / steps,
                                     lambda p, v, length, steps=steps:
-                                    fixed_steps(p, v, length, steps)))
+                                    fixed_steps(p, v, length, steps, TWIST)))
             tightest = 25 if name == "float64" else 15
             for i in range(13, 14) if quick else range(8, tightest):
                 tolerance = 10 ** (-i / 2)
                 contestants.append((length, "Dormand–Prince", name, float_t, tolerance,
                                     lambda p, v, length, tolerance=tolerance:
-                                    adaptive_steps(p, v, length, tolerance)))
+                                    adaptive_steps(p, v, length, tolerance, TWIST)))
     rows = []
     for length, method, precision, float_t, knob, run in contestants:
         # So many that the closed form, too, takes longer than its start

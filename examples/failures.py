@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import drjit as dr
-from drjit.llvm import Array3f, Array3f64, Float, Float64, UInt32
+from drjit.llvm import Array3f, Array3f64, Float, Float64
 
 sys.path[:0] = [str(Path(__file__).resolve().parent.parent / part) for part in ("", "tests")]
 
@@ -27,6 +27,7 @@ import face_crossing  # noqa: E402
 import report_formulas  # noqa: E402
 import test_failures_geodesics as geodesics  # noqa: E402
 import test_failures_tracing as tracing  # noqa: E402
+import tracing_methods  # noqa: E402
 import truth  # noqa: E402
 from nil_mitsuba import geometry  # noqa: E402
 
@@ -35,94 +36,20 @@ TOLERANCE = 1e-6
 RAYS = 20_000
 
 
-# ---------------------------------------------------------------------------
-#  General methods: the geodesic equation with Christoffel symbols, in coordinates
-# ---------------------------------------------------------------------------
-
-def acceleration(p, u, k):
-    """−Γ(u, u) for the coordinate velocity u."""
-    w = u.z - k * p.x * u.y
-    y = k * w * u.x
-    return Array3f(-k * w * u.y, y, k * u.x * u.y + k * p.x * y)
-
-
-def rates(state, k):
-    p, u = state
-    return u, acceleration(p, u, k)
-
-
-def moved(state, h, *terms):
-    """state + h Σ weight · rate."""
-    return tuple(x + h * sum((weight * rate[i] for weight, rate in terms[1:]),
-                             terms[0][0] * terms[0][1][i]) for i, x in enumerate(state))
-
-
-def rk4_step(state, h, k):
-    k1 = rates(state, k)
-    k2 = rates(moved(state, h, (0.5, k1)), k)
-    k3 = rates(moved(state, h, (0.5, k2)), k)
-    k4 = rates(moved(state, h, (1.0, k3)), k)
-    return moved(state, h, (1 / 6, k1), (1 / 3, k2), (1 / 3, k3), (1 / 6, k4))
-
-
-@dr.syntax
 def rk4(p, v, t, k):
-    """Points after the lengths t, by RK4 with a fixed step."""
-    state = p, Array3f(geometry.from_frame(p, v, k))
-    steps = UInt32(dr.maximum(dr.ceil(dr.abs(t) / RK4_STEP - 1e-4), 1))
-    h, n = t / Float(steps), UInt32(0)
-    while n < steps:
-        state = rk4_step(state, h, k)
-        n += 1
-    return state[0]
+    return tracing_methods.fixed_steps(p, v, t, math.ceil(t / RK4_STEP), k)
 
 
-# Dormand and Prince (1980), RK5(4)7M: weights of the stages, and of the difference of the two
-STAGES = (
-    (1/5,),
-    (3/40, 9/40),
-    (44/45, -56/15, 32/9),
-    (19372/6561, -25360/2187, 64448/6561, -212/729),
-    (9017/3168, -355/33, 46732/5247, 49/176, -5103/18656),
-    (35/384, 0, 500/1113, 125/192, -2187/6784, 11/84),
-)
-DIFFERENCE = (71/57600, 0, -71/16695, 71/1920, -17253/339200, 22/525, -1/40)
-
-
-def dormand_prince_step(state, s, h, t, k):
-    """The state, the length covered and the next step, after one that was taken or refused."""
-    stage, after = [rates(state, k)], state
-    for weights in STAGES:
-        after = moved(state, h, *zip(weights, stage))
-        stage.append(rates(after, k))
-    wrong = moved((Array3f(0), Array3f(0)), h, *zip(DIFFERENCE, stage))
-    error = dr.maximum(dr.max(dr.abs(wrong[0])), dr.max(dr.abs(wrong[1])))
-    error /= TOLERANCE * (1 + dr.max(dr.abs(state[0])))
-    good = (error <= 1) | (h < 1e-5)
-    s = dr.select(good, s + h, s)
-    state = tuple(dr.select(good, new, old) for new, old in zip(after, state))
-    h *= dr.clip(0.9 * dr.power(dr.maximum(error, 1e-10), -0.2), 0.2, 5.0)
-    return state, s, dr.minimum(h, t - s)
-
-
-@dr.syntax
 def dormand_prince(p, v, t, k):
-    """Points after the lengths t ≥ 0, by the adaptive pair."""
-    state = p, Array3f(geometry.from_frame(p, v, k))
-    s, h, n = dr.zeros(Float, dr.width(p)), dr.minimum(Float(0.1), t), UInt32(0)
-    # What cannot be done in so many steps counts as not done
-    while (s < t) & (n < 20_000):
-        state, s, h = dormand_prince_step(state, s, h, t, k)
-        n += 1
-    return dr.select(s >= t, state[0], dr.nan)
+    return tracing_methods.adaptive_steps(p, v, t, TOLERANCE, k)
 
 
 def package(p, v, t, k):
-    return geometry.flow(p, v, t, k)[0]
+    return geometry.flow(p, v, dr.opaque(Float, t), dr.opaque(Float, k))[0]
 
 
 def report(p, v, t, k):
-    return report_formulas.geodesic(p, v, t) if k == 1 else Array3f(dr.nan)
+    return report_formulas.geodesic(p, v, dr.opaque(Float, t), dr.opaque(Float, k))[0]
 
 
 METHODS = {"report's formula": report, "RK4": rk4, "Dormand–Prince": dormand_prince,
@@ -139,17 +66,8 @@ def number(error):
 
 def worst_errors(p, v, t, k=1):
     """Largest error of each method, as text."""
-    row = []
-    for name, method in METHODS.items():
-        if name == "report's formula" and k != 1:
-            row.append("—")
-            continue
-        kernel_k = k if name == "report's formula" else dr.opaque(Float, k)
-        length = dr.opaque(Float, t)
-        error = geodesics.errors_of_a_way(lambda p, v, _: method(p, v, length, kernel_k), p, v, t,
-                                          k)
-        row.append(number(dr.max(error)[0]))
-    return row
+    return [number(dr.max(geodesics.errors_of_a_way(
+        lambda p, v, _: method(p, v, t, k), p, v, t, k))[0]) for method in METHODS.values()]
 
 
 def directions():
@@ -177,21 +95,19 @@ def places_and_twists():
         yield f"length 5, twist {k:g}", worst_errors(*geodesics.random_rays(RAYS), 5, k)
 
 
-def sign_change(method, p, v, axis, c, t_max):
-    """First sign change of the coordinate at samples RK4_STEP apart, and the secant's root."""
+def sign_change(p, v, axis, c, t_max):
+    """First sign change of the coordinate between steps of RK4, and the secant's root."""
+    method = tracing_methods.RungeKutta4(dr.opaque(Float, RK4_STEP), dr.opaque(Float, 1))
+    state = method.start(p, v)
     before, found = p[axis] - c, dr.full(Float, math.inf, dr.width(p))
     for n in range(1, round(t_max / RK4_STEP) + 1):
-        p, v = method(p, v)
-        now = p[axis] - c
+        state = method.step(state, dr.inf)[0]
+        now = state["p"][axis] - c
         crossed = (before * now <= 0) & (found == math.inf)
         found = dr.select(crossed, RK4_STEP * (n - 1 + before / (before - now)), found)
         before = now
-        dr.eval(p, v, before, found)
+        dr.eval(state, before, found)
     return found
-
-
-def rk4_pieces(p, u):
-    return rk4_step((p, u), dr.opaque(Float, RK4_STEP), dr.opaque(Float, 1))
 
 
 def crossing_times(p, v, axis, faces, t_max):
@@ -214,7 +130,7 @@ def faces():
         ahead = dr.select(v[axis] > 0, Float(1), 0)
         exact = crossing_times(p, v, axis, [ahead], 20)
         formula = (report_formulas.crossing_of_x, report_formulas.crossing_of_y, None)[axis]
-        stepped = sign_change(rk4_pieces, p, Array3f(geometry.from_frame(p, v, 1)), axis, ahead, 20)
+        stepped = sign_change(p, v, axis, ahead, 20)
         yield (f"the face {name} ahead, crossed by ray: wrong for",
                [share_off(formula(p, v, ahead), exact) if formula else "not given",
                 share_off(stepped, exact), "like RK4",
@@ -245,7 +161,7 @@ def tangents():
     p, v, c = Array3f(p), Array3f(v), Float(c)
     shifted = [crossing_times(p, v, 2, [Float64(c) + shift], 12) for shift in (0, -1e-5, 1e-5)]
     exact = dr.select(dr.abs(shifted[2] - shifted[1]) < 0.01, shifted[0], math.inf)
-    stepped = sign_change(rk4_pieces, p, Array3f(geometry.from_frame(p, v, 1)), 2, c, 12)
+    stepped = sign_change(p, v, 2, c, 12)
     yield ("planes z = c that a ray only just crosses: wrong for",
            ["not given", share_off(stepped, exact, 0.01), "like RK4",
             share_off(face_crossing.first_crossing(p, v, 2, c, Float(12)), exact, 0.01)])

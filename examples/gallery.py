@@ -18,6 +18,7 @@ import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.J
 
 # isort: split
 import mitsuba as mi
+
 from sheet import contact_sheet
 
 ROOT = Path(__file__).resolve().parents[1]

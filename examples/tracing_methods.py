@@ -12,9 +12,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+import report_formulas
 from nil_mitsuba import geometry
-from nil_mitsuba.quotient import exit_through_face, through_face
-from nil_mitsuba.tracer import Hit, Tracer
+from nil_mitsuba.quotient import through_face
+from nil_mitsuba.tracer import Hit, Tracer, line_ray
 
 
 class Euler:
@@ -154,6 +155,32 @@ class DormandPrince(RungeKutta4):
         return stepped, h, good
 
 
+def fixed_steps(p, v, length, steps, twist):
+    """End points after so many equal steps of the classical Runge–Kutta method."""
+    float_t = type(p.x)
+    method = RungeKutta4(dr.opaque(float_t, length / steps), dr.opaque(float_t, twist))
+    steps = dr.opaque(dr.llvm.UInt32, steps)
+    _, state = dr.while_loop(
+        (dr.zeros(dr.llvm.UInt32, dr.width(p)), method.start(p, v)),
+        lambda i, state: i < steps, lambda i, state: (i + 1, method.step(state, dr.inf)[0]))
+    return state["p"]
+
+
+def adaptive_steps(p, v, length, tolerance, twist):
+    """End points by the pair of Dormand and Prince, each ray with steps of its own."""
+    float_t = type(p.x)
+    method = DormandPrince(dr.opaque(float_t, tolerance), dr.opaque(float_t, twist), chords=False)
+    length = dr.opaque(float_t, length)
+
+    def step(t, state):
+        state, h, good = method.step(state, length - t)
+        return dr.select(good, dr.select(h < length - t, t + h, length), t), state
+
+    _, state = dr.while_loop((dr.zeros(float_t, dr.width(p)), method.start(p, v)),
+                             lambda t, state: t < length, step)
+    return state["p"]
+
+
 class ClosedForm(Euler):
     """Chords of fixed length; ``geometry.flow`` from where the ray started or entered the cell."""
 
@@ -181,29 +208,11 @@ class ClosedForm(Euler):
         return type(v0)(dr.fma(v0.x, cos, -v0.y * sin), dr.fma(v0.y, cos, v0.x * sin), v0.z)
 
 
-def printed_flow(p, v, t, twist):
-    """The geodesic as VISGRAF TR-19-06 prints it, with k: it divides by w and by w².
-
-    x = c/ω (sin(ωt + α) − sin α), y = −c/ω (cos(ωt + α) − cos α) with ω = k w, and
-    z = w t + k c²/ω (t/2 − (sin(2ωt + 2α) − sin 2α)/4ω + sin α (cos(ωt + α) − cos α)/ω).
-    """
-    c, alpha, omega = dr.hypot(v.x, v.y), dr.atan2(v.y, v.x), twist * v.z
-    sin_0, cos_0 = dr.sincos(alpha)
-    sin_t, cos_t = dr.sincos(dr.fma(omega, t, alpha))
-    x = c / omega * (sin_t - sin_0)
-    y = -c / omega * (cos_t - cos_0)
-    # sin 2φ = 2 sin φ cos φ
-    z = v.z * t + twist * dr.square(c) / omega * (
-        0.5 * t - (sin_t * cos_t - sin_0 * cos_0) / (2 * omega) + sin_0 * (cos_t - cos_0) / omega)
-    return (type(p)(geometry.multiply(p, type(p)(x, y, z), twist)),
-            type(v)(c * cos_t, c * sin_t, v.z))
-
-
 class PrintedForm(ClosedForm):
     """Chords of fixed length; the closed form as printed in the report."""
 
     def formula(self, p, v, t):
-        return printed_flow(p, v, t, self.twist)
+        return report_formulas.geodesic(p, v, t, self.twist)
 
 
 class ChordTracer(Tracer):
@@ -221,12 +230,11 @@ class ChordTracer(Tracer):
         """First hit of the geodesic from ``p`` in frame direction ``v`` within ``reach``."""
         return self._follow(p, v, p, reach, active, time, False)
 
-    def occluded(self, p, v, cone, reach, active, time=0, start=None):
+    def occluded(self, p, start, v, cone, reach, active, time=0):
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach``.
 
         The first chord begins at ``start``, off the surface on which ``p`` lies.
         """
-        start = p if start is None else start
         return self._follow(p, v, start, reach, active, time, True).valid
 
     @dr.syntax
@@ -257,22 +265,11 @@ class ChordTracer(Tracer):
             last = length >= reach - t0
             t1 = dr.select(fresh & good, dr.select(last, reach, t0 + length), t1)
 
-            along = mi.Vector3f(state["p"] - vertex)
-            s_last = mi.Float(1)
-            leaves = mi.Bool(False)
-            face = mi.Vector3i(0)
-            if space.quotient:
-                s_last, face = exit_through_face(vertex, along)
-                leaves = s_last < 1
-                s_last = dr.minimum(s_last, 1)
-            speed = dr.norm(along)
-            d = dr.select(speed > 0, along / speed, v0)
-            # Pieces overlap by the rounding of their joint, but none reaches past the ends.
-            before = dr.select(t0 > 0, space.slack, 0)
+            along, s_last, leaves, face, speed, o, d, before = self.piece(
+                vertex, state["p"], v0, t0)
+            # No piece reaches past the end.
             after = dr.select(leaves | (t1 < reach), space.slack, 0)
-            ray = dr.zeros(mi.Ray3f)
-            ray.o, ray.d, ray.time = space.to_scene(vertex - before * d), d, time
-            ray.maxt = (s_last * speed + before + after) * space.size
+            ray = line_ray(o, d, time, (s_last * speed + before + after) * space.size)
 
             # --------------------------- What it met ---------------------------
             there = mi.Bool(False)

@@ -15,9 +15,9 @@ import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.J
 # isort: split
 import drjit as dr
 import mitsuba as mi
-from sheet import contact_sheet
 
 from nil_mitsuba import geometry
+from sheet import contact_sheet
 
 SHOWCASE = Path(__file__).resolve().parents[1] / "scenes" / "showcase.xml"
 

@@ -272,7 +272,7 @@ class NilIntegrator(ADIntegrator):
         reach = light.distance * (1 - SHADOW_EPSILON)
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))
-        return ~tracer.occluded(p, light.direction, cone, reach, active, si.time, start)
+        return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time)
 
     @dr.syntax
     def _beyond_lights(self, view, time, p, v, cone, active):
@@ -308,9 +308,11 @@ def _warn_of_what_is_ignored(scene, integrator):
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
     for shape in scene.shapes():
         name = f'"{shape.id() or shape.class_name()}"'
-        box = shape_box(shape)
-        reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
-        if integrator.quotient and reach > margin:
+        reach = 0
+        if integrator.quotient:
+            box = shape_box(shape)
+            reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
+        if reach > margin:
             mi.Log(mi.LogLevel.Warn,
                    f"nil: the shape {name} reaches {reach:.4g} scene units out of the cube "
                    f"{lower} to {upper}: what lies outside is never seen. Move it, or set "

@@ -84,6 +84,13 @@ def hash_to_unit(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
     return mi.Float(mixed >> 9) * 2**-23
 
 
+def line_ray(o: mi.Point3f, d: mi.Vector3f, time: mi.Float, maxt: mi.Float = dr.inf) -> mi.Ray3f:
+    """A ray (scene) that Embree can follow."""
+    ray = dr.zeros(mi.Ray3f)
+    ray.o, ray.d, ray.time, ray.maxt = o, d, time, maxt
+    return ray
+
+
 class Bend:
     """How much the geodesic in frame direction ``v`` bends at most, along all of its length.
 
@@ -141,6 +148,8 @@ class Tracer:
         # Shorter chords, and hits that lie closer to the geodesic, are lost in float32's rounding.
         self.least = opaque(dr.maximum(1e-4, 16 * space.slack))
         self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
+        if space.quotient:  # no ray leaves the cube
+            return
         box = scene_box(scene)
         if not box.valid():  # a scene of environment emitters only
             box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
@@ -202,6 +211,26 @@ class Tracer:
         turn = k * v.z
         y = turn * v.x
         return mi.Vector3f(-turn * v.y, y, dr.fma(k * p.x, y, k * v.x * v.y))
+
+    def piece(self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float):
+        """What of the chord from ``vertex`` to ``end`` lies in this cell.
+
+        Returns the chord; the fraction of it that is inside, whether it leaves and through which
+        face; its length; start (scene) and direction of a ray along it, and how far (cells) that
+        begins before ``vertex``. ``direction`` is taken for that of a chord without length.
+        """
+        along = mi.Vector3f(end - vertex)
+        s_last, leaves, face = mi.Float(1), mi.Bool(False), mi.Vector3i(0)
+        if self.space.quotient:
+            s_last, face = exit_through_face(vertex, along)
+            leaves = s_last < 1
+            s_last = dr.minimum(s_last, 1)
+        speed = dr.norm(along)
+        d = dr.select(speed > 0, along / speed, direction)
+        # Pieces overlap by the rounding of their joint, but none reaches behind the start.
+        before = dr.select(t0 > 0, self.space.slack, 0)
+        o = self.space.to_scene(vertex - before * d)
+        return along, s_last, leaves, face, speed, o, d, before
 
     # ------------------------------------------------------------------ tracing
 
@@ -271,22 +300,10 @@ class Tracer:
                 cap = dr.select(fresh & ~redo, 2 * cap, cap)
                 redo = mi.Bool(False)
 
-                along = mi.Vector3f(end - vertex)
-                s_last = mi.Float(1)
-                leaves = mi.Bool(False)
-                face = mi.Vector3i(0)
-                if quotient:
-                    s_last, face = exit_through_face(vertex, along)
-                    leaves = s_last < 1
-                    s_last = dr.minimum(s_last, 1)
-                speed = dr.norm(along)
-                d = dr.select(speed > 0, along / speed, direction)
-                # Pieces overlap by the rounding of their joint, but none reaches behind the start.
-                before = dr.select(t0 > 0, space.slack, 0)
-                o = space.to_scene(vertex - before * d)
-                ray = dr.zeros(mi.Ray3f)
-                ray.o, ray.d, ray.time = o, d, time
-                ray.maxt = dr.fma(s_last, speed, before + space.slack) * space.size
+                along, s_last, leaves, face, speed, o, d, before = self.piece(
+                    vertex, end, direction, t0)
+                ray = line_ray(o, d, time,
+                               dr.fma(s_last, speed, before + space.slack) * space.size)
                 found = scene.ray_intersect_preliminary(ray, coherent=False,
                                                         active=searching & ~empty)
                 there = found.is_valid()
@@ -316,8 +333,7 @@ class Tracer:
             side = mi.Float(0)
             if looking:
                 # Newton's step from the chord's hit to the surface's tangent plane there
-                ray = dr.zeros(mi.Ray3f)
-                ray.o, ray.d, ray.time = o, d, time
+                ray = line_ray(o, d, time)
                 met = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, looking)
                 side = dr.sign(dr.dot(met.n, d))
                 point, tangent = geometry.flow(base, direction, at - t1, k)
@@ -334,9 +350,8 @@ class Tracer:
                 speed = dr.norm(along)
                 line = along / speed
                 start = space.to_scene(dr.fma(along, s_first, point) - space.slack * line)
-                ray = dr.zeros(mi.Ray3f)
-                ray.o, ray.d, ray.time = start, line, time
-                ray.maxt = dr.fma(s_last - s_first, speed, 2 * space.slack) * space.size
+                ray = line_ray(start, line, time,
+                               dr.fma(s_last - s_first, speed, 2 * space.slack) * space.size)
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=looking)
                 # A tangent that meets a surface from the other side than the chord did has found
                 # where the geodesic comes back, or what lies behind its start.
@@ -357,14 +372,13 @@ class Tracer:
             cap = dr.select(redo, 0.125 * scale, cap)
             active = mi.Bool(redo)
 
-        ray = dr.zeros(mi.Ray3f)
-        ray.o, ray.d, ray.time = o, d, time
         distance = dr.select(valid, distance, dr.inf)
-        return Hit(valid, distance, turned(v, k * v.z * distance), cell, ray, found)
+        return Hit(valid, distance, turned(v, turn * distance), cell,
+                   line_ray(o, d, time), found)
 
     @dr.syntax
-    def occluded(self, p: mi.Point3f, v: mi.Vector3f, cone: Cone, reach: mi.Float,
-                 active: mi.Bool, time: mi.Float = 0, start: mi.Point3f | None = None) -> mi.Bool:
+    def occluded(self, p: mi.Point3f, start: mi.Point3f, v: mi.Vector3f, cone: Cone,
+                 reach: mi.Float, active: mi.Bool, time: mi.Float = 0) -> mi.Bool:
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach`` (cells).
 
         The first chord begins at ``start``: off the surface on which ``p`` lies, while the last one
@@ -375,7 +389,7 @@ class Tracer:
         space, scene = self.space, self.scene
         k = space.twist
         quotient = space.quotient
-        vertex, end = mi.Point3f(p if start is None else start), mi.Point3f(p)
+        vertex, end = mi.Point3f(start), mi.Point3f(p)
         t0, t1 = mi.Float(0), mi.Float(0)
         direction = mi.Vector3f(v)
         bend = Bend(v, k)
@@ -397,22 +411,10 @@ class Tracer:
             end, direction = geometry.flow(end, direction, h, k)
             t1 += h
 
-            along = mi.Vector3f(end - vertex)
-            s_last = mi.Float(1)
-            leaves = mi.Bool(False)
-            face = mi.Vector3i(0)
-            if quotient:
-                s_last, face = exit_through_face(vertex, along)
-                leaves = s_last < 1
-                s_last = dr.minimum(s_last, 1)
-            speed = dr.norm(along)
-            d = dr.select(speed > 0, along / speed, direction)
-            before = dr.select(t0 > 0, space.slack, 0)
-            o = space.to_scene(vertex - before * d)
+            along, s_last, leaves, face, speed, o, d, before = self.piece(
+                vertex, end, direction, t0)
             after = dr.select(leaves | ~last, space.slack, 0)
-            ray = dr.zeros(mi.Ray3f)
-            ray.o, ray.d, ray.time = o, d, time
-            ray.maxt = (s_last * speed + before + after) * space.size
+            ray = line_ray(o, d, time, dr.fma(s_last, speed, before + after) * space.size)
             hit = scene.ray_test(ray, coherent=False, active=active & ~empty)
 
             blocked |= hit

@@ -12,6 +12,8 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 
+sys.path.append(str(ROOT / "examples"))  # what they measure with is tested, too
+
 
 @pytest.fixture
 def rgb():
