@@ -341,9 +341,16 @@ class View:
                         for _ in LAYERS[layer]]
                 for layer in self.layers}
 
+    @dr.syntax
     def see(self, seen, hit, si, home, spent, first):
         """The channels of each layer after a vertex, which counts where ``first``."""
-        first &= si.is_valid()
+        if dr.hint(len(self.layers) > 0, mode="scalar"):
+            first = first & si.is_valid()
+            if first:  # a branch: later vertices need not compute them
+                seen = self._channels_of(hit, si, home, spent, first)
+        return seen
+
+    def _channels_of(self, hit, si, home, spent, first):
         found = {}
         for layer in self.layers:
             if layer == "distance":
@@ -370,8 +377,7 @@ class View:
                 shape = dr.select(si.instance == None, si.shape, si.instance)  # noqa: E711
                 number = dr.reinterpret_array(mi.UInt32, shape)
                 found[layer] = [dr.gather(mi.Int32, self.shape_numbers, number, first)]
-        return {layer: [dr.select(first, new, old) for new, old in zip(found[layer], seen[layer])]
-                for layer in self.layers}
+        return found
 
     def _number_shapes(self):
         pointers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.scene.shapes()]
