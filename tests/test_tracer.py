@@ -9,14 +9,15 @@ import truth
 WIDTH = HEIGHT = 512
 
 
-def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH):
-    """Primary rays through the pixel centres of a square image, as the integrator starts them."""
+def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH, make=None):
+    """Primary rays through the pixel centres of a square image, as the integrator starts them,
+    and the tracer, the package's unless ``make`` makes another."""
     from nil_mitsuba.camera import Camera
     from nil_mitsuba.quotient import Space
     from nil_mitsuba.tracer import Tracer
 
     space = Space(twist, quotient, [0, 0, 0], 1.0)
-    tracer = Tracer(scene, space, 12.0)
+    tracer = (make or Tracer)(scene, space, 12.0)
     sensor = mi.load_dict({
         "type": "perspective", "fov": 70,
         "to_world": mi.ScalarTransform4f().look_at(origin, target, [0.01, 0.02, 1]),
@@ -35,7 +36,7 @@ SETUPS = {
 }
 
 
-def compare(mi, kind, twist, tolerance, width=WIDTH):
+def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
     """Shares of rays that name another surface, away from silhouettes and near them, and the
     largest error across the geodesic of those that do not, in units of its allowance."""
     from nil_mitsuba.interaction import surface_interaction
@@ -43,7 +44,7 @@ def compare(mi, kind, twist, tolerance, width=WIDTH):
     surfaces, quotient, origin, target = SETUPS[kind]
     surfaces = surfaces()
     scene = mi.load_dict({"type": "scene", **truth.to_mitsuba(surfaces, mi)})
-    tracer, p, v, cone = camera(mi, twist, quotient, tolerance, scene, origin, target, width)
+    tracer, p, v, cone = camera(mi, twist, quotient, tolerance, scene, origin, target, width, make)
     start = mi.Point3f(p)
     hit = tracer.intersect(start, v, cone, tracer.reach(start, v), mi.Bool(True))
     si = surface_interaction(hit, v, tracer.space, mi.Color0f())
