@@ -95,7 +95,7 @@ def test_accelerations_come_from_the_christoffel_symbols(methods):
 def test_chords_converge_to_the_true_hits(chart, place):
     """A third of the step makes a ninth of the error where the ends of chords are exact."""
     rays = chart.Rays(chart.setups()[place], 48)
-    selection = chart.Selection(rays, rays.indices(5, 48**2), 5)
+    selection = chart.Selection(rays, rays.indices(5), 5)
     factors = {"Euler pieces": (2, 4.5), "Runge–Kutta 4": (6, 13), "stable form": (6, 13),
                "printed form": (6, 13)}
     for method, (least, most) in factors.items():
@@ -103,26 +103,47 @@ def test_chords_converge_to_the_true_hits(chart, place):
                                      selection, 1) for step in (0.06, 0.02))
         assert least < coarse["position"] / fine["position"] < most
         assert fine["direction"] < coarse["direction"] / 2
-        assert fine["other surface"] < coarse["other surface"]
-        assert fine["not a number"] == 0
+        if method == "printed form":
+            # Shorter steps do not help where w vanishes
+            assert fine["other surface"] > 1e-3
+        else:
+            assert fine["other surface"] < coarse["other surface"] / 2
+            assert fine["not a number"] == 0
     loose, tight = (chart.errors(chart.tracer_of("Dormand–Prince", knob, rays.scene, rays.space),
                                  selection, 1) for knob in (1e-3, 1e-4))
-    assert 5 < loose["position"] / tight["position"] < 20
+    assert 7 < loose["position"] / tight["position"] < 14
 
 
-@pytest.mark.parametrize("place", range(6))
-def test_the_package_finds_the_true_hits_of_every_scene_of_the_chart(chart, place):
+# Error of position that half of the hits and 1 % of them exceed: three times what was measured. A
+# convex mirror magnifies, most of all what it meets at a grazing angle.
+ERRORS = (6e-7, 5e-6), (6e-7, 5e-6), (6e-7, 5e-6), (6e-7, 5e-6), (2e-6, 4e-5), (1.3e-5, 6.5e-4)
+
+
+@pytest.mark.parametrize("place, errors", list(enumerate(ERRORS)))
+def test_the_package_finds_the_true_hits_of_every_scene_of_the_chart(chart, place, errors):
     rays = chart.Rays(chart.setups()[place], 48)
-    selection = chart.Selection(rays, rays.indices(5, 48**2), 5)
+    selection = chart.Selection(rays, rays.indices(5), 5)
     tracer = chart.tracer_of(chart.PACKAGE, chart.DEFAULT, rays.scene, rays.space)
     row = chart.errors(tracer, selection, chart.DEFAULT)
     assert row["hits"] > 0.1 * row["rays"]
-    # A convex mirror magnifies, most of all what it meets at a grazing angle
-    mirrored = rays.setup.mirror is not None
-    assert row["position"] < (1e-5 if mirrored else 1e-6)
-    assert row["position 99 %"] < (1e-3 if mirrored else 1e-5)
-    assert row["other surface"] < 3e-3
-    assert chart.chords_per_ray(tracer, selection, chart.DEFAULT) > 2
+    assert row["position"] < errors[0]
+    assert row["position 99 %"] < errors[1]
+    # Three rays of 2,304; one was measured
+    assert row["other surface"] < 1.4e-3
+    assert row["not a number"] == 0
+    # Of which the plain scenes' and the mirrors' rays take the most
+    assert 20 < row["chords"] < 200
+
+
+def test_dividing_by_w_makes_no_number_of_horizontal_rays(chart):
+    """All of them are counted as such, though Embree takes them for rays that meet nothing."""
+    rays = chart.Rays(chart.setups()[1], 16)
+    rays.v = chart.mi.Vector3f(dr.normalize(chart.mi.Vector3f(rays.v.x, rays.v.y, 0)))
+    selection = chart.Selection(rays, rays.indices(5), 5)
+    for method, knob, share in (("printed form", 0.1, 1), ("stable form", 0.1, 0),
+                                ("Runge–Kutta 4", 0.1, 0), (chart.PACKAGE, chart.DEFAULT, 0)):
+        tracer = chart.tracer_of(method, knob, rays.scene, rays.space)
+        assert chart.errors(tracer, selection, 1.0)["not a number"] == share
 
 
 # ---------------------------------------------------------------------------
