@@ -1,4 +1,4 @@
-"""The closed form that divides by w, and its face crossings, as VISGRAF TR-19-06 has them.
+"""The closed form that divides by w, and its face crossings, in the form of VISGRAF TR-19-06.
 
 For comparison only: the package uses neither. The crossings are those of twist 1. Any Dr.Jit type
 of 32 or 64 bit; points in cells, directions as frame components, (c cos α, c sin α, w) in the

@@ -209,7 +209,7 @@ class ClosedForm(Euler):
 
 
 class PrintedForm(ClosedForm):
-    """Chords of fixed length; the closed form as printed in the report."""
+    """Chords of fixed length; the closed form in the report's form, which divides by w."""
 
     def formula(self, p, v, t):
         return report_formulas.geodesic(p, v, t, self.twist)

@@ -59,7 +59,7 @@ def test_the_error_of_an_adaptive_pair_follows_its_tolerance(methods, chart):
         assert 1e-3 * tolerance < error < 10 * tolerance
 
 
-def test_both_closed_forms_are_exact_but_the_printed_one_fails_where_w_vanishes(methods, chart):
+def test_closed_forms_are_exact_but_the_one_that_divides_by_w_fails_without_it(methods, chart):
     p, v = chart.random_starts(1000, Float64)
     exact, turned = truth.flow(p, v, Float64(5), Float64(1))
     for formula in (report_formulas.geodesic, chart.geometry.flow):
