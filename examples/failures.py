@@ -1,202 +1,318 @@
-"""Prints where methods of following a geodesic of Nil fail, and by how much: a Markdown table.
+"""Prints where methods of tracing geodesics of Nil fail, and by how much: two Markdown tables.
 
-The formula is the closed form of VISGRAF TR-19-06, which divides by w; RK4 takes steps of 1/20 of a
-cell; the adaptive pair is that of Dormand and Prince with a tolerance of 1e-6. All are in float32.
-Errors are distances in cells from the true point, which is computed in float64 by code of its own
-(tests/truth.py): the largest of all rays. Crossings of faces are those of tests/face_crossing.py,
-which brackets the package's ``flow`` between its extrema. Twist 1 unless a row says otherwise.
+The first is about a geodesic alone. The formula is the closed form of VISGRAF TR-19-06, which
+divides by w; RK4 takes steps of 1/20 of a cell; the adaptive pair is that of Dormand and Prince
+with a tolerance of 1e-6. Errors are distances in cells from the true point, the largest of all
+rays, and in brackets the share of rays that are off by more than 1e-3. Crossings of faces are those
+of tests/face_crossing.py, which brackets the package's ``flow`` between its extrema.
+
+The second is about rays that look for surfaces; in brackets, the share of rays that name another
+one. The tracers are those of tests/test_failures_tracing.py: chords of 1/20 of a cell by the
+printed formula and by RK4, the adaptive pair with a tolerance of 1e-4 for its chords, and the
+package at its default tolerance.
+
+All are in float32; the truth is computed in float64 by code of its own (tests/truth.py). Twist 1
+unless a row says otherwise. Takes about a quarter of an hour.
 """
 
+import argparse
 import math
 import sys
+import tempfile
 from pathlib import Path
-
-import drjit as dr
-from drjit.llvm import Array3f, Array3f64, Float, Float64
 
 sys.path[:0] = [str(Path(__file__).resolve().parent.parent / part) for part in ("", "tests")]
 
-import nil_mitsuba  # noqa: E402, F401 - before mitsuba: it chooses LLVM
+import nil_mitsuba  # noqa: E402, F401 - before mitsuba and drjit: it chooses LLVM
 
 # isort: split
+import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
+from drjit.llvm import Array3f, Array3f64, Float64  # noqa: E402
 
 mi.set_variant("llvm_ad_rgb")
 
-import face_crossing  # noqa: E402
 import report_formulas  # noqa: E402
 import test_failures_geodesics as geodesics  # noqa: E402
 import test_failures_tracing as tracing  # noqa: E402
+import test_tracer  # noqa: E402
 import tracing_methods  # noqa: E402
 import truth  # noqa: E402
-from nil_mitsuba import geometry  # noqa: E402
+from test_failures_faces import (  # noqa: E402
+    FURTHER,
+    KNOBS,
+    crossings_ahead,
+    crossings_just_reached,
+    first_crossing,
+    rays_off,
+    sign_change,
+)
 
-RK4_STEP = 0.05
-TOLERANCE = 1e-6
-RAYS = 20_000
-
-
-def rk4(p, v, t, k):
-    return tracing_methods.fixed_steps(p, v, t, math.ceil(t / RK4_STEP), k)
-
-
-def dormand_prince(p, v, t, k):
-    return tracing_methods.adaptive_steps(p, v, t, TOLERANCE, k)
-
-
-def package(p, v, t, k):
-    return geometry.flow(p, v, dr.opaque(Float, t), dr.opaque(Float, k))[0]
-
-
-def report(p, v, t, k):
-    return report_formulas.geodesic(p, v, dr.opaque(Float, t), dr.opaque(Float, k))[0]
+METHODS = {"report's formula": geodesics.report,
+           "Runge–Kutta 4, step 0.05": geodesics.runge_kutta,
+           "Dormand–Prince, 1e-6": geodesics.dormand_prince,
+           "package": geodesics.package}
+TRACERS = {"printed form, chords 0.05": "printed form",
+           "Runge–Kutta 4, chords 0.05": "Runge–Kutta 4",
+           "Dormand–Prince, 1e-4": "Dormand–Prince",
+           "package": "package"}
+NOT_GIVEN, NOTHING = "not given", "–"
 
 
-METHODS = {"report's formula": report, "RK4": rk4, "Dormand–Prince": dormand_prince,
-           "package": package}
+class Sizes:
+    """How much is measured: all of it, or enough to see that it runs."""
 
+    def __init__(self, quick):
+        self.quick = quick
 
-# ---------------------------------------------------------------------------
-#  Rows
-# ---------------------------------------------------------------------------
+    def rays(self, count):
+        return count // 100 if self.quick else count
+
+    def lengths(self, lengths):
+        return lengths[:1] if self.quick else lengths
+
 
 def number(error):
-    return "NaN" if not math.isfinite(error) else f"{error:.1e}".replace("e-0", "e-")
+    if math.isnan(error):
+        return "NaN"
+    if 0.01 <= error < 1000:
+        return f"{float(f'{error:.2g}'):g}"
+    return "∞" if math.isinf(error) else f"{error:.1e}".replace("e-0", "e-").replace("e+0", "e")
 
 
-def worst_errors(p, v, t, k=1):
-    """Largest error of each method, as text."""
-    return [number(dr.max(geodesics.errors_of_a_way(
-        lambda p, v, _: method(p, v, t, k), p, v, t, k))[0]) for method in METHODS.values()]
+def share(part, whole=1):
+    percent = 100 * part / max(whole, 1)
+    return "0" if part == 0 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
-def directions():
-    for w in (0, 1e-7, 1e-5, 1e-3, 1e-2, 1e-1):
-        yield f"w = {w:g}, length 5", worst_errors(*geodesics.random_rays(RAYS, w), 5)
-    for w in (1, 1 - 1e-6):
-        yield f"w = {w:g} (along the fibre), length 5", worst_errors(
-            *geodesics.random_rays(RAYS, w), 5)
-    p, v = geodesics.random_rays(RAYS, 0.75)
+# ---------------------------------------------------------------------------
+#  Geodesics alone
+# ---------------------------------------------------------------------------
+
+def worst_errors(*rays, k=1):
+    """Largest error of each method over sets of rays (p, v, length), and the share beyond 1e-3."""
+    cells = []
+    for method in METHODS.values():
+        # An end point that is not a number counts as infinitely far
+        errors = [geodesics.end_point_errors(method, p, v, t, k) for p, v, t in rays]
+        off = sum(dr.count(error > 1e-3)[0] for error in errors)
+        count = sum(map(len, errors))
+        if all(dr.all(error == math.inf) for error in errors):
+            cells.append("NaN")
+        else:
+            largest = max(dr.max(error)[0] for error in errors)
+            cells.append(number(largest) + (f" ({share(off, count)})" if off else ""))
+    return cells
+
+
+def directions(sizes):
+    count = sizes.rays(20_000)
+    for name, components in (("w = 0", [0]), ("w = 1e-5", [1e-5]), ("w = 1e-3", [1e-3]),
+                             ("w = ±1, c = 0", [1, -1]), ("w = ±(1 − 1e-6)", [1 - 1e-6, 1e-6 - 1])):
+        yield f"{name}, length 5", worst_errors(
+            *((*geodesics.random_rays(count, w), 5) for w in components))
+    rays = geodesics.random_rays(count, 0.75)
     t = 2 * math.sqrt(2) / 0.75
-    yield "the switch of formula, k w t/2 = √2", worst_errors(p, v, t)
+    yield ("both sides of the switch of formula, k w t/2 = √2",
+           worst_errors((*rays, t * (1 - 1e-5)), (*rays, t * (1 + 1e-5))))
 
 
-def lengths():
-    p, v = geodesics.random_rays(4000)
+def lengths(sizes):
+    p, v = geodesics.random_rays(sizes.rays(20_000))
     for t in geodesics.LENGTHS:
-        yield f"length {t}, random directions", worst_errors(p, v, t)
+        yield f"any direction, length {t}", worst_errors((p, v, t))
 
 
-def places_and_twists():
-    for out in (1e2, 1e4):
-        p, v = geodesics.random_rays(4000)
-        yield f"length 5, {out:g} cells from the origin", worst_errors(p + out, v, 5)
+def places_and_twists(sizes):
+    p, v = geodesics.random_rays(sizes.rays(20_000))
+    for out in (100, 10_000):
+        yield f"{out:,} cells from the identity, length 5", worst_errors((p + out, v, 5))
     for k in (1e-6, 3, 8):
-        yield f"length 5, twist {k:g}", worst_errors(*geodesics.random_rays(RAYS), 5, k)
+        yield f"twist {k:g}, length 5".replace("e-0", "e-"), worst_errors(
+            (p, v, 5), k=k)
 
 
-def sign_change(p, v, axis, c, t_max):
-    """First sign change of the coordinate between steps of RK4, and the secant's root."""
-    method = tracing_methods.RungeKutta4(dr.opaque(Float, RK4_STEP), dr.opaque(Float, 1))
-    state = method.start(p, v)
-    before, found = p[axis] - c, dr.full(Float, math.inf, dr.width(p))
-    for n in range(1, round(t_max / RK4_STEP) + 1):
-        state = method.step(state, dr.inf)[0]
-        now = state["p"][axis] - c
-        crossed = (before * now <= 0) & (found == math.inf)
-        found = dr.select(crossed, RK4_STEP * (n - 1 + before / (before - now)), found)
-        before = now
-        dr.eval(state, before, found)
-    return found
-
-
-def crossing_times(p, v, axis, faces, t_max):
-    exact = [face_crossing.first_crossing(Array3f64(p), Array3f64(v), axis, Float64(face),
-                                          Float64(t_max)) for face in faces]
-    return exact[0] if len(exact) == 1 else dr.minimum(*exact)
-
-
-def share_off(found, exact, allowed=1e-3):
-    meets = dr.isfinite(exact)
-    off = meets & ~(dr.abs(Float64(found) - exact) <= allowed)
-    return f"{dr.count(off)[0] / dr.count(meets)[0]:.2%}"
-
-
-def faces():
-    """Share of rays from the unit cell whose first crossing of the face that they head for is off
-    by a thousandth of a cell or more, or not found, of those that cross it within 20 cells."""
-    p, v = geodesics.random_rays(100_000)
+def crossings(sizes):
+    """The first crossing of the face of the unit cell that a ray heads for: off by a thousandth of
+    a cell, missed, or found where there is none within 20 cells. Of all rays."""
     for axis, name in enumerate("xyz"):
-        ahead = dr.select(v[axis] > 0, Float(1), 0)
-        exact = crossing_times(p, v, axis, [ahead], 20)
+        p, v, ahead, exact = crossings_ahead(Array3f, axis, sizes.rays(100_000))
         formula = (report_formulas.crossing_of_x, report_formulas.crossing_of_y, None)[axis]
-        stepped = sign_change(p, v, axis, ahead, 20)
-        yield (f"the face {name} ahead, crossed by ray: wrong for",
-               [share_off(formula(p, v, ahead), exact) if formula else "not given",
-                share_off(stepped, exact), "like RK4",
-                share_off(face_crossing.first_crossing(p, v, axis, ahead, Float(20)), exact)])
+        found = [formula(p, v, ahead) if formula else None]
+        found += [sign_change(method, p, v, axis, ahead, FURTHER)
+                  for method in ("Runge–Kutta 4", "Dormand–Prince")]
+        found += [first_crossing(p, v, axis, ahead, FURTHER)]
+        yield (f"crossing of the face {name} ahead, off for",
+               [NOT_GIVEN if t is None else share(rays_off(t, exact), dr.width(p))
+                for t in found])
 
 
-def walls():
-    """The same for the package's tracer and two walls of 100 cells at a face and its opposite."""
-    p, v = geodesics.random_rays(20_000)
-    for axis, name in enumerate("xyz"):
+def tangents(sizes):
+    p, v, c, exact = crossings_just_reached(sizes.rays(100_000))
+    found = [sign_change(method, p, v, 2, c, 12.0)
+             for method in ("Runge–Kutta 4", "Dormand–Prince")]
+    found += [first_crossing(p, v, 2, c, 12.0)]
+    yield ("crossing of a plane z = c that a ray only just reaches, off for",
+           [NOT_GIVEN] + [share(rays_off(t, exact, 0.01, 11.9), dr.width(p)) for t in found])
+
+
+# ---------------------------------------------------------------------------
+#  Tracing
+# ---------------------------------------------------------------------------
+
+def by_each(measure):
+    """A row: what ``measure`` says of each tracer, given its name and what makes it."""
+    return [measure(name, tracing.TRACERS[name]) for name in TRACERS.values()]
+
+
+def faces(sizes):
+    if sizes.quick:
+        tracing.COUNT = 100
+    kinds = {
+        "through edges and corners": ["corner", *(f"edge along {axis}" for axis in "xyz")],
+        "tangent to a face": [f"tangent to face {axis}" for axis in "xyz"],
+        "starting on a face": [f"starting on face {axis}" for axis in "xyz"],
+    }
+    for kind, names in kinds.items():
+        p, v = tracing.aimed_rays(names, 1)
+        count = tracing.COUNT * len(names)
+        yield (f"{kind}: name another surface, of {count:,} rays",
+               by_each(lambda _, make: share(dr.count(tracing.naming(
+                   truth.cell_scene(), p, v, 1, True, make=make)[2])[0], count)))
+    yield (f"along a face: miss the wall ahead, of {3 * tracing.COUNT:,} rays",
+           by_each(lambda _, make: share(sum(tracing.walls_along_faces(axis, 1, make)[0]
+                                             for axis in range(3)), 3 * tracing.COUNT)))
+
+
+def off(error, wrong):
+    """An error, and the share of rays that name another surface."""
+    return number(error) + (f" ({share(wrong)})" if wrong else "")
+
+
+def walls(sizes):
+    """Walls of 100 cells at two opposite faces, met or passed by rays from between them."""
+    count = sizes.rays(20_000)
+    p, v = geodesics.random_rays(count)
+    scenes = []
+    for axis in range(3):
         shapes = {}
         for face in (0, 1):
             corner, sides = [-50.0] * 3, [[0.0] * 3, [0.0] * 3]
             corner[axis] = float(face)
             sides[0][axis - 2] = sides[1][axis - 1] = 100.0
             shapes[f"s{face}"] = truth.Rectangle(tuple(corner), *map(tuple, sides)).to_mitsuba(mi)
-        t = tracing.Traced(shapes, p, v, 1, False, 20.0).t
-        yield (f"walls at the faces {name}, met by the tracer: wrong for",
-               share_off(t, crossing_times(p, v, axis, (0, 1), 20)))
+        exact = [first_crossing(Array3f64(p), Array3f64(v), axis, Float64(face), FURTHER)
+                 for face in (0, 1)]
+        scenes.append((shapes, dr.minimum(*exact)))
+
+    def passed(_, make):
+        return share(sum(rays_off(tracing.Traced(shapes, p, v, 1, False, FURTHER, make=make).t,
+                                  exact) for shapes, exact in scenes), 3 * count)
+
+    yield f"walls at the faces: met 1e-3 off or not at all, of {3 * count:,} rays", by_each(passed)
 
 
-def tangents():
-    """Planes that a ray crosses twice within less than a step, touching them to 1e-2 … 1e-5 cells
-    (closer, rounding decides whether it touches them at all)."""
-    from test_failures_faces import tangent_rays
+def long_ways(sizes):
+    for t in sizes.lengths((20, 100, 500)):
+        def walk(name, _):
+            walked = (geodesics.walked if name == "package" else
+                      geodesics.stepped(tracing_methods.METHODS[name], KNOBS[name]))
+            errors = geodesics.walk_errors(t, 1, sizes.rays(4000), walked)
+            return " / ".join(number(dr.max(error)[0]) for error in errors)
 
-    p, v, c = tangent_rays(100_000, 2, 1, 12.0)
-    p, v, c = Array3f(p), Array3f(v), Float(c)
-    shifted = [crossing_times(p, v, 2, [Float64(c) + shift], 12) for shift in (0, -1e-5, 1e-5)]
-    exact = dr.select(dr.abs(shifted[2] - shifted[1]) < 0.01, shifted[0], math.inf)
-    stepped = sign_change(p, v, 2, c, 12)
-    yield ("planes z = c that a ray only just crosses: wrong for",
-           ["not given", share_off(stepped, exact, 0.01), "like RK4",
-            share_off(face_crossing.first_crossing(p, v, 2, c, Float(12)), exact, 0.01)])
+        yield f"wrapped way of {t} cells: error there / walked back", by_each(walk)
+    for bins in sizes.lengths((tracing.NEAR, tracing.FAR)):
+        count = sizes.rays(tracing.ENOUGH[bins])
+        columns = by_each(lambda _, make: tracing.long_ray_errors(1, bins, count, make))
+        for i, (low, high, hits, *_) in enumerate(columns[0]):
+            yield (f"hits {low} to {high} cells away: error, largest of {hits:,}",
+                   [off(rows[i][5], rows[i][3]) for rows in columns])
 
 
-def tracer():
-    """What only a tracer can get wrong, for the package's at the default tolerance."""
-    for twist in (1, 3):
-        for low, high, hits, other, most, largest in tracing.long_ray_errors(twist):
-            yield (f"hits {low} to {high} cells away, twist {twist} ({hits} rays)",
-                   f"error 99 % {most:.1e}, largest {largest:.1e}; {other:.2%} name another copy")
-        for t in geodesics.LENGTHS:
-            _, wrapped, returned = geodesics.long_way_errors(t, twist)
-            yield (f"a wrapped walk of {t} cells, twist {twist}",
-                   f"largest error {dr.max(wrapped)[0]:.1e}, {dr.max(returned)[0]:.1e} "
-                   "back at its start")
-    for distance in (0, 1e2, 1e3, 1e4):
-        wrong, error = tracing.size_errors(1.0, distance)
-        yield (f"a scene {distance:g} cells from the origin",
-               f"error 99 % {error:.1e}; {wrong:.2%} name another surface")
-    for size in (1e-3, 1e4):
-        wrong, error = tracing.size_errors(size, 0)
-        yield (f"cell_size {size:g}", f"error 99 % {error:.1e}; {wrong:.2%} name another surface")
+def places_and_sizes(sizes):
+    count = sizes.rays(20_000)
+
+    def text(wrong_and_error):
+        return off(*reversed(wrong_and_error))
+
+    for name, size in (("1e-3", 1e-3), ("1e4", 1e4)):
+        yield f"cell_size {name}: error of 99 %", by_each(
+            lambda _, make: text(tracing.size_errors(size, 0, count, make)))
+    yield "10,000 cells from the origin, cell_origin too: error of 99 %", by_each(
+        lambda _, make: text(tracing.size_errors(1.0, 10_000, count, make)))
+    for distance in (100, 1000):
+        yield f"{distance:,} cells from the identity: error of 99 %", by_each(
+            # Fewer rays: the adaptive pair takes its smallest steps here
+            lambda _, make: text(tracing.far_errors(distance, count // 10, make)))
+
+
+def thin_things(sizes):
+    count = sizes.rays(20_000)
+    yield "sheets 1e-3 thick: name the other side", by_each(
+        lambda _, make: share(*tracing.sheet_rays(count, make)))
+    with tempfile.TemporaryDirectory() as folder:
+        yield "needle triangles: passed, or met 8e-4 off", by_each(
+            lambda _, make: share(*tracing.needles_passed(Path(folder), 1, make, 10,
+                                                          sizes.rays(50_000))))
+    width = 32 if sizes.quick else 512
+    found = by_each(lambda _, make: test_tracer.compare(mi, "quotient", 1, 0.25, width, make)[:2])
+    for i, where in enumerate(("away from silhouettes", "within a pixel of silhouettes")):
+        yield f"camera rays {where}: name another surface", [share(row[i]) for row in found]
+
+
+def contacts(sizes):
+    yield "from contacts and corners: name another surface", by_each(
+        lambda _, make: share(*tracing.contact_rays(sizes.rays(20_000), make)))
+    spp = 1 if sizes.quick else 64
+    yield "closed rooms, of one surface and of sheets, lights outside: pixels lit", by_each(
+        lambda _, make: share(sum(tracing.leaking_pixels(kind, 1, make, spp)
+                                  for kind in ("one surface", "sheets")), 2048))
+    yield "glowing corner: pixels too dark or too bright", by_each(
+        lambda _, make: share(tracing.off_in_a_corner(1, make), 1024))
+
+
+def mirrors_and_glass(sizes):
+    yield "inside a glass ball: rays trapped / of another energy", by_each(
+        lambda _, make: " / ".join(share(part) for part in tracing.inside_glass(1, make)))
+
+    def mirrors(_, make):
+        wrong, lost = tracing.off_between_mirrors(1, 10 if sizes.quick else 200, make)
+        return f"{share(wrong, 1024)} / {number(abs(lost))}"
+
+    yield "two mirrors, depth 200: pixels off / energy off", by_each(mirrors)
+
+
+def connections(sizes):
+    count = sizes.rays(50_000)
+
+    def row(miss):
+        return [NOT_GIVEN, NOTHING, NOTHING, number(miss)]
+
+    yield "connection to a point about its switch of formula: largest miss", row(
+        max(dr.max(geodesics.about_the_switch(Array3f, 1, side, count)[0])[0] for side in (-1, 1)))
+    yield "connection to a point about its cut: largest miss", row(
+        dr.max(geodesics.about_the_cut(Array3f, 1, count)[0])[0])
+    misses = tracing.further_misses(sizes.rays(20_000))
+    yield "further geodesics to a light: miss of 99 %", row(misses[len(misses) * 99 // 100])
+    yield "down to 2e-4 cells from a caustic: largest miss", row(misses[-1])
+
+
+def print_table(columns, groups, sizes):
+    print("| Where | " + " | ".join(columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for rows in groups:
+        for where, row in rows(sizes):
+            print(f"| {where} | " + " | ".join(row) + " |", flush=True)
 
 
 def main():
-    print("| Where | " + " | ".join(METHODS) + " |")
-    print("|---" * (len(METHODS) + 1) + "|")
-    for rows in (directions, lengths, places_and_twists, faces, tangents):
-        for where, row in rows():
-            print(f"| {where} | " + " | ".join(row) + " |", flush=True)
-    print("\n| Where | the package's tracer |\n|---|---|")
-    for rows in (walls, tracer):
-        for where, what in rows():
-            print(f"| {where} | {what} |", flush=True)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few rays, to see that it runs")
+    sizes = Sizes(parser.parse_args().quick)
+    print_table(METHODS, (directions, lengths, places_and_twists, crossings, tangents), sizes)
+    print()
+    print_table(TRACERS, (faces, walls, long_ways, places_and_sizes, thin_things, contacts,
+                          mirrors_and_glass, connections), sizes)
 
 
 if __name__ == "__main__":

@@ -26,8 +26,9 @@ def first_crossing(p, v, axis, c, t_max, twist=1):
     Arc length t in (0, t_max] of the first crossing of the plane with coordinate ``axis`` = ``c``.
 
     p: points in cells; v: unit directions in frame components, Dr.Jit vectors of 32 or 64 bit;
-    axis: 0, 1 or 2; c, t_max: cells, t_max finite. Infinite where there is none. A tangent ray
-    crosses where it touches, as far as rounding can tell; a start on the plane does not count.
+    axis: 0, 1 or 2; c, t_max: cells, t_max finite, and at most 10⁴ periods 2π/|k w| where axis is
+    2. Infinite where there is none. A tangent ray crosses where it touches, as far as rounding can
+    tell; a start on the plane does not count.
     """
     value_t = dr.value_t(type(p))
     twist, c, t_max = value_t(twist), value_t(c), value_t(t_max)
@@ -128,7 +129,8 @@ def _first_z(p, v, c, t_max, twist):
     c2 = dr.fma(v.x, v.x, v.y * v.y)
     gain = orientation * dr.fma(0.5 * c2, dr.rcp(w_safe), v.z) * period
     skips = (period <= t_max) & (gain > 0) & (top < 0)
-    # One part in 10⁴ less than the quotient: a rounded one must not skip the right period
+    # One part in 10⁴ less than the quotient: a rounded one must not skip the right period. Of 10⁴
+    # periods it begins one early, and three are looked at
     first = dr.select(skips, dr.ceil(0.9999 * -top / dr.select(skips, gain, 1)), 0)
     first = dr.maximum(first - 1, 0)
     begin = dr.select(first > 0, first * period, 0)
