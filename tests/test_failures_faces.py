@@ -263,7 +263,6 @@ def test_chords_of_an_ode_method_pass_faces_that_a_ray_only_just_crosses(rgb, na
     p, v, c, exact = crossings_just_reached()
     off = rays_off(sign_change(name, p, v, 2, c, 12.0), exact, 0.01, 11.9)
     assert 0.02 < off / dr.width(p) < 0.06
-    print(rays_off(first_crossing(p, v, 2, c, 12.0), exact, 0.01, 11.9))
     assert rays_off(first_crossing(p, v, 2, c, 12.0), exact, 0.01, 11.9) <= 1
 
 

@@ -39,8 +39,8 @@ def chords(method, knob):
     return make
 
 
-# The package at its default tolerance takes some 30 chords for 5 cells; steps of 0.05 are 100, and
-# the adaptive pair takes 70 to 100 at 1e-4
+# Of chords, or searches along tangents, a ray takes 41 (fixed), 52 (Dormand–Prince) and 34 (package)
+# in ``room_scene``, and 52, 59 and 78 in ``cell_scene``
 TRACERS = {name: chords(name, knob) for name, knob in KNOBS.items()} | {"package": package}
 OTHERS = [name for name in TRACERS if name != "package"]
 
