@@ -470,20 +470,17 @@ def chords_expected(method, knob, length):
     return length / step
 
 
-# A setting that takes more chords for a ray is left out: no image is rendered with so many
-MOST_CHORDS = 2000
-
-
-def measure(rays, length, rounds):
+def measure(rays, length, rounds, most):
     """Rows of the table for one setup and length: every method with every setting of its knob.
 
-    All of them trace the same rays.
+    All of them trace the same rays. Settings that take more than about ``most`` chords for one are
+    left out.
     """
     entries = []
     selection = Selection(rays, rays.indices(length), length)
     for method, knobs in KNOBS.items():
         for knob in knobs:
-            if chords_expected(method, knob, length) > MOST_CHORDS:
+            if chords_expected(method, knob, length) > most:
                 continue
             tolerance = knob if method == PACKAGE else 1.0
             tracer = tracer_of(method, knob, rays.scene, rays.space)
@@ -967,8 +964,10 @@ def main():
         wide = main or setup.mirror is not None
         rays = Rays(setup, 64 if quick else 368 if wide else 256)
         for length in (MAIN["length"],) if quick else LENGTHS:
-            rounds = 1 if quick else 3 if main and length == MAIN["length"] else 2
-            rows += measure(rays, length, rounds)
+            if main and length == MAIN["length"]:
+                rows += measure(rays, length, 1 if quick else 3, 2000)
+            else:
+                rows += measure(rays, length, 2 if length == MAIN["length"] else 1, 700)
         report(f"traced: {setup.kind}, {setup.space}", began)
     lengths = (5,) if quick else (5, 1, 20)
     end_rows = end_points(lengths, 1 if quick else 3, quick)
