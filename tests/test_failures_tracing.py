@@ -39,8 +39,8 @@ def chords(method, knob):
     return make
 
 
-# Of chords, or searches along tangents, a ray takes 41 (fixed), 52 (Dormand–Prince) and 34 (package)
-# in ``room_scene``, and 52, 59 and 78 in ``cell_scene``
+# Of chords, and searches along tangents, a ray takes 41 (fixed), 52 (Dormand–Prince) and 34
+# (package) in ``room_scene``, and 52, 59 and 78 in ``cell_scene``
 TRACERS = {name: chords(name, knob) for name, knob in KNOBS.items()} | {"package": package}
 OTHERS = [name for name in TRACERS if name != "package"]
 
@@ -202,8 +202,8 @@ def test_rays_aimed_at_faces_edges_and_corners_meet_the_true_surface(rgb, twist)
     _, exact, wrong, unexplained = compare(truth.cell_scene(), *aimed_rays(kinds, twist), twist,
                                            True)
     assert not [kinds[i // COUNT] for i in unexplained]
-    # Silhouettes are as rare among aimed rays as among others, one in 500
-    assert len(wrong) <= 0.002 * COUNT * len(kinds)
+    # 8 and 9 of 65,000 are measured
+    assert len(wrong) <= 4e-4 * COUNT * len(kinds)
     for i, kind in enumerate(kinds):
         hits = dr.count(dr.gather(Int32, exact.label, dr.arange(UInt32, COUNT) + i * COUNT) >= 0)
         assert hits[0] > 0.2 * COUNT or kind.startswith("along")
@@ -298,10 +298,9 @@ def test_a_hit_looked_back_from_sees_the_start_of_its_ray(rgb, twist):
     error = dr.norm(truth.multiply_inverse(Array3f64(p), home, Float64(twist)))
     error = dr.select(traced.valid, error, 0)
     assert dr.count(traced.valid)[0] > 200
-    # The arrival is off by two roundings of a turn of k t radians, and the way back is t long
+    # A rounding of the arrival's azimuth grows with the square of the way back
     t = dr.select(traced.valid, traced.t, 0)
-    turned = 4 * 2**-24 * (1 + twist * t)
-    assert dr.all(error <= 2e-5 + 2e-6 * t + turned * t * (1 + 0.5 * twist * t))
+    assert dr.all(error <= 5e-6 + 3 * 2**-24 * twist * dr.square(t))
 
 
 def scaled(surfaces, size, origin):
@@ -402,7 +401,7 @@ def test_rays_of_any_twist_meet_the_true_surface(rgb, twist):
     p, v, _ = random_rays(20_000, -1, 1)
     _, _, wrong, unexplained = compare(truth.room_scene(), p, v, twist, False)
     assert len(unexplained) == 0
-    assert len(wrong) <= 0.002 * dr.width(p)
+    assert len(wrong) <= 3  # none of 20,000 is measured
 
 
 @pytest.mark.parametrize("name", OTHERS)

@@ -74,13 +74,18 @@ def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
                                               label=label, g=g, p=p, v=v, cone=cone, tracer=tracer)
 
 
+# Three times what is measured: the share of rays near silhouettes that name another surface, and
+# the part of their allowance by which hits are off
+LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 0.22)}
+
+
 @pytest.mark.parametrize("kind, twist", [("quotient", 0), ("quotient", 1), ("quotient", 2),
                                          ("plain", 1), ("plain", 2)])
 def test_every_ray_names_the_true_surface(rgb, kind, twist):
     far, close, error, _ = compare(rgb, kind, twist, 0.25)
-    assert far <= 1e-4
-    assert close <= 0.06
-    assert error <= 1
+    assert far == 0
+    assert close <= LIMITS[kind][0]
+    assert error <= LIMITS[kind][1]
     finer = compare(rgb, kind, twist, 0.25 / 4)
     assert twist == 0 or finer[1] < close
 
