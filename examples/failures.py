@@ -12,7 +12,7 @@ printed formula and by RK4, the adaptive pair with a tolerance of 1e-4 for its c
 package at its default tolerance.
 
 All are in float32; the truth is computed in float64 by code of its own (tests/truth.py). Twist 1
-unless a row says otherwise. Takes about a quarter of an hour.
+unless a row says otherwise. Takes about five minutes of two cores.
 """
 
 import argparse
