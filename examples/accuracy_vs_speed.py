@@ -960,14 +960,13 @@ def main():
         main = setup.kind == MAIN["scene"] and setup.space == MAIN["space"]
         if quick and not main:
             continue
-        # 64 thousand rays, twice as many in the scene of the first chart; as many on a mirror
-        wide = main or setup.mirror is not None
-        rays = Rays(setup, 64 if quick else 368 if wide else 256)
+        # Four blocks of rays, eight for the first chart; two where all are traced twice
+        rays = Rays(setup, 64 if quick else 368 if main else 256)
         for length in (MAIN["length"],) if quick else LENGTHS:
             if main and length == MAIN["length"]:
-                rows += measure(rays, length, 1 if quick else 3, 2000)
+                rows += measure(rays, length, 1 if quick else 2, 2000)
             else:
-                rows += measure(rays, length, 2 if length == MAIN["length"] else 1, 700)
+                rows += measure(rays, length, 1, 700)
         report(f"traced: {setup.kind}, {setup.space}", began)
     lengths = (5,) if quick else (5, 1, 20)
     end_rows = end_points(lengths, 1 if quick else 3, quick)
@@ -979,7 +978,7 @@ def main():
         if quick and (setup.kind, setup.space) != ("sparse", "plain"):
             continue
         found = (images(setup, IMAGE_KNOBS[-2:], 32, 24, 1, (1, 2, 4), 4) if quick
-                 else images(setup, IMAGE_KNOBS, 80, 60, 16, (1, 4, 8), 256))
+                 else images(setup, IMAGE_KNOBS, 80, 60, 8, (1, 4, 8), 128))
         image_rows += found[0]
         differences += found[1]
         report(f"rendered: {setup.kind}, {setup.space}", began)
