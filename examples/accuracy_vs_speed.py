@@ -316,8 +316,9 @@ def trace(tracer, selection, tolerance):
     """The hit that counts, the direction in which its segment started, and its cell."""
     setup, space = selection.rays.setup, selection.rays.space
     p, v = selection.p, selection.v
+    # Opaque: one kernel for all tolerances and lengths
+    tolerance, length = (dr.opaque(mi.Float, x) for x in (tolerance, selection.length))
     cone = Cone(tolerance * selection.cone.width, tolerance * selection.cone.spread)
-    length = dr.opaque(mi.Float, selection.length)
     hit = tracer.intersect(p, v, cone, dr.minimum(tracer.reach(p, v), length), mi.Bool(True))
     if setup.mirror is None:
         return hit, v, hit.cell
@@ -390,7 +391,8 @@ def errors(tracer, selection, tolerance):
 
     exact = rays.exact
     t = dr.gather(Float64, exact.t, index)
-    true_label = dr.select(t <= selection.length, dr.gather(Int32, exact.label, index), -1)
+    length = dr.opaque(Float64, selection.length)
+    true_label = dr.select(t <= length, dr.gather(Int32, exact.label, index), -1)
     true_g, true_p, true_v = (dr.gather(Array3i, exact.g, index),
                               dr.gather(Array3f64, exact.p_cell, index),
                               dr.gather(Array3f64, exact.v, index))
