@@ -140,15 +140,42 @@ def flow(p, v, t, twist=1):
     """
     h, s, c = _half_turn(t, v.z, twist)
     sinc, g = _sinc_and_g(h, s, c)
-    # Frame direction at the middle of the arc, which is the direction of its chord, and at its end
-    a, b = dr.fma(v.x, c, -v.y * s), dr.fma(v.y, c, v.x * s)
-    a_t, b_t = dr.fma(a, c, -b * s), dr.fma(b, c, a * s)
+    c2 = dr.fma(v.x, v.x, v.y * v.y)
+    return _along_helix(p, _turned(v, s, c), c2, t, twist, h, s, c, sinc, g)
+
+
+def short_flow(p, v, t, h, twist=1):
+    """`flow` by a short step ``h`` (cells), |k w h| ≤ 1, from the point ``p`` at arc length ``t``.
+
+    ``v``: frame direction at arc length 0: that of a step is turned from it, so that the rounding
+    of many steps does not add up.
+    """
+    turn = twist * v.z
+    half = 0.5 * turn * h
+    y = dr.square(half)
+    # On y ≤ 1/4 the first terms left out are below 3e-10 and 1e-9
+    c = _polynomial(y, [(-1)**n / factorial(2*n) for n in range(5)])
+    g = _polynomial(y, [(-1)**n * (2*n + 2) / factorial(2*n + 3) for n in range(4)])
+    sinc = dr.fma(y, g, c)
+    c2 = dr.fma(v.x, v.x, v.y * v.y)
+    middle = _turned(v, *dr.sincos(turn * dr.fma(0.5, h, t)))
+    return _along_helix(p, middle, c2, h, twist, half, half * sinc, c, sinc, g)
+
+
+def _turned(v, s, c):
+    return type(v)(dr.fma(v.x, c, -v.y * s), dr.fma(v.y, c, v.x * s), v.z)
+
+
+def _along_helix(p, middle, c2, t, twist, h, s, c, sinc, g):
+    """End of an arc of length t with the half turn h, from the frame direction at its middle.
+
+    That is the direction of the arc's chord, too.
+    """
     chord = t * sinc
-    x, y = chord * a, chord * b
-    swept2 = dr.square(t) * dr.fma(v.x, v.x, v.y * v.y)
-    z = dr.fma(0.25 * twist * h * _lift(sinc, c, g), swept2, t * v.z)
+    x, y = chord * middle.x, chord * middle.y
+    z = dr.fma(0.25 * twist * h * _lift(sinc, c, g), dr.square(t) * c2, t * middle.z)
     z = dr.fma(twist * y, dr.fma(0.5, x, p.x), z)
-    return type(p)(p.x + x, p.y + y, p.z + z), type(v)(a_t, b_t, v.z)
+    return type(p)(p.x + x, p.y + y, p.z + z), _turned(middle, s, c)
 
 
 def area_density(t, w, twist=1):
@@ -207,21 +234,29 @@ def connect(p, q, twist=1):
     zeta_lost = dr.fma(twist, height, -zeta) + twist * height_lost
     orientation = dr.select(zeta < 0, -1.0, 1.0)
 
-    x, far = _solve_half_turn(R, zeta * orientation, zeta_lost * orientation)
-    sin_x, cos_x, sinc_x, g_x, lift_x = _on_quarter(x)
+    zeta, zeta_lost = zeta * orientation, zeta_lost * orientation
 
-    # v = π − x where far: what a fibre makes of 0/0 is the limit of the circle radius R / sin v
-    v = dr.select(far, pi - x, x)
-    s, c = sin_x, dr.select(far, -cos_x, cos_x)
-    v_far, s_far, k_far = (dr.select(far, value, 1.0) for value in (v, s, k))
-    sinc = dr.select(far, s / v_far, sinc_x)
-    g = dr.select(far, (s - v * c) / (v_far * dr.square(v_far)), g_x)
-    radius = dr.select(far, dr.maximum(R, _ON_FIBRE[_is_double(R)]) / s_far, 0)
-    # c T and w T. Near, the equation itself gives w T without dividing by k
-    inv_sinc = dr.rcp(sinc_x)
-    horizontal = dr.select(far, 2 * radius * v / k_far, r * inv_sinc)
-    vertical = dr.select(far, dr.copysign(2 * v / k_far, height),
-                         height / dr.fma(0.5 * dr.square(R * inv_sinc), lift_x, 1))
+    # Half turns up to π/2, where the equation itself gives w T without dividing by k
+    zeta_quarter = dr.fma(pi / 2, dr.square(R), pi)
+    s, c, sinc, g, lift = _on_quarter(_near_half_turn(R, zeta, zeta_quarter))
+    inv_sinc = dr.rcp(sinc)
+    horizontal = r * inv_sinc
+    vertical = height / dr.fma(0.5 * dr.square(R * inv_sinc), lift, 1)
+    near = (s, c, sinc, g, horizontal, vertical)
+
+    def far(R, zeta, zeta_lost, height, k, near):
+        # What a fibre makes of 0/0 is the limit of the circle radius R / sin v
+        x = _far_half_turn(R, zeta, zeta_lost)
+        s, c, _, _, _ = _on_quarter(x)
+        v, c = pi - x, -c
+        radius = dr.maximum(R, _ON_FIBRE[_is_double(R)]) / s
+        return (s, c, s / v, (s - v * c) / (v * dr.square(v)), 2 * radius * v / k,
+                dr.copysign(2 * v / k, height))
+
+    # A branch: it costs as much as the rest, and few points lie beyond
+    s, c, sinc, g, horizontal, vertical = dr.if_stmt(
+        (R, zeta, zeta_lost, height, k, near), zeta > zeta_quarter, far,
+        lambda R, zeta, zeta_lost, height, k, near: near)
 
     distance = _length(horizontal, vertical)
     inv_distance = dr.rcp(dr.select(distance > 0, distance, 1.0))
@@ -253,48 +288,59 @@ _TWO_PI = {False: (6.2831854820251465, -1.7484555e-07),
            True: (6.283185307179586, 2.4492935982947064e-16)}
 
 
-def _solve_half_turn(R, zeta, zeta_lost):
-    """Root of ``2v + R² μ(v) = ζ ≥ 0`` as ``(x, far)``: ``v = x`` or, where far, ``v = π − x``.
+def _near_half_turn(R, zeta, zeta_quarter):
+    """Root v ≤ π/2 of ``2v + R² μ(v) = ζ``, 0 ≤ ζ ≤ ``zeta_quarter``, its value at π/2.
 
-    ``μ(v) = (v − sin v cos v)/sin² v``; ``x ≤ π/2`` is the well-conditioned unknown on either
-    side, since ``μ(π − x) = π/sin² x − μ(x)`` crowds the root against π on a fibre.
+    ``μ(v) = (v − sin v cos v)/sin² v``.
+    """
+    R2 = dr.square(R)
+    # μ(v)/v runs from 2/3 to 1 at π/2: its limit for large R, fitted in (ζ / ζ(π/2))²
+    quarter = dr.minimum(dr.square(zeta / zeta_quarter), 1)
+    x = zeta / dr.fma(R2, dr.fma(quarter, dr.fma(quarter, -0.16, 0.493), 2/3), 2)
+    for _ in range(_NEWTON_STEPS[_is_double(R)]):
+        _, _, mu, slope = _mu(x)
+        x = x - (dr.fma(R2, mu, 2 * x) - zeta) / dr.fma(R2, slope, 2)
+    return x
+
+
+def _far_half_turn(R, zeta, zeta_lost):
+    """The x ≤ π/2 for which ``v = π − x`` is the root of ``2v + R² μ(v) = ζ``.
+
+    ``μ(π − x) = π/sin² x − μ(x)`` crowds the root against π on a fibre, where x is still
+    well-conditioned.
     """
     double = _is_double(R)
-    R2 = dr.square(R)
-    zeta_quarter = dr.fma(pi / 2, R2, pi)
-    far = zeta > zeta_quarter
-
-    # μ(v)/v runs from 2/3 to 1 at π/2: its limit for large R, fitted in (ζ / ζ(π/2))²
-    quarter = dr.square(zeta / zeta_quarter)
-    near_guess = zeta / dr.fma(R2, dr.fma(quarter, dr.fma(quarter, -0.16, 0.493), 2/3), 2)
-
-    # μ(π − x) ≈ π/x² + π/3 − 0.477 x, exact at π/2 but for 1e-2, leaves x²(x + h) = n
     two_pi, two_pi_lost = _TWO_PI[double]
     excess = (zeta - two_pi) + (zeta_lost - two_pi_lost)
-    R2_far = dr.square(dr.maximum(R, _ON_FIBRE[double]))
-    inv_slope = dr.rcp(dr.fma(0.477, R2_far, 2))
-    n = pi * R2_far * inv_slope
+    R2 = dr.square(dr.maximum(R, _ON_FIBRE[double]))
+
+    # μ(π − x) ≈ π/x² + π/3 − 0.477 x, exact at π/2 but for 1e-2, leaves x²(x + h) = n
+    inv_slope = dr.rcp(dr.fma(0.477, R2, 2))
+    n = pi * R2 * inv_slope
     unit = dr.cbrt(n)
-    h = dr.fma(-pi / 3, R2_far, excess) * inv_slope / unit
+    h = dr.fma(-pi / 3, R2, excess) * inv_slope / unit
     # Root of x²(x + h) = 1 to 1e-2, by what it tends to at h = 0 and at h = ±∞
     h_pos, h_neg = dr.maximum(h, 0), dr.maximum(-h, 0)
     root_pos = dr.rsqrt(h_pos + dr.rsqrt(dr.fma(2/3, h_pos, 1)))
     root_neg = h_neg + dr.rcp(dr.fma(h_neg, dr.fma(0.5, h_neg, 2/3), 1))
-    far_guess = dr.minimum(unit * dr.select(h > 0, root_pos, root_neg), pi / 2)
+    x = dr.minimum(unit * dr.select(h > 0, root_pos, root_neg), pi / 2)
 
-    x = dr.select(far, far_guess, near_guess)
-    target = dr.select(far, -excess, zeta)
     for _ in range(_NEWTON_STEPS[double]):
-        s, c, sinc, g, lift = _on_quarter(x)
-        inv_sinc = dr.rcp(sinc)
-        mu = x * lift * dr.square(inv_sinc)
-        # dμ/dx = 2 (sin x − x cos x)/sin³ x
-        slope = 2 * g * dr.square(inv_sinc) * inv_sinc
-        inv_s = dr.rcp(dr.select(far, s, 1.0))
-        pole = dr.select(far, pi * R2_far * dr.square(inv_s), 0)
-        residual = dr.fma(R2, mu, 2 * x) - pole - target
+        s, c, mu, slope = _mu(x)
+        inv_s = dr.rcp(s)
+        pole = pi * R2 * dr.square(inv_s)
+        residual = dr.fma(R2, mu, 2 * x) - pole + excess
         x = x - residual / (dr.fma(R2, slope, 2) + 2 * pole * c * inv_s)
-    return x, far
+    return x
+
+
+def _mu(x):
+    """sin x, cos x, ``μ(x) = (x − sin x cos x)/sin² x`` and its derivative for 0 ≤ x ≤ π/2."""
+    s, c, sinc, g, lift = _on_quarter(x)
+    inv_sinc = dr.rcp(sinc)
+    inv_sinc2 = dr.square(inv_sinc)
+    # dμ/dx = 2 (sin x − x cos x)/sin³ x
+    return s, c, x * lift * inv_sinc2, 2 * g * inv_sinc2 * inv_sinc
 
 
 def _on_quarter(x):

@@ -269,7 +269,8 @@ def test_an_opaque_twist_shares_its_kernel():
                        if kernel["type"] == dr.KernelType.JIT)
 
     twists = [dr.opaque(dr.llvm.Float, k) for k in (1, 2, 0)]
-    compiled(twists[0])
+    for _ in range(2):  # what a first call leaves behind orders the kernels of all others
+        compiled(twists[0])
     assert compiled(twists[1]) == 0 and compiled(twists[2]) == 0
 
 
