@@ -230,10 +230,11 @@ class ChordTracer(Tracer):
         """First hit of the geodesic from ``p`` in frame direction ``v`` within ``reach``."""
         return self._follow(p, v, p, reach, active, time, False)
 
-    def occluded(self, p, start, v, cone, reach, active, time=0):
+    def occluded(self, p, start, v, cone, reach, active, time=0, far=True):
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach``.
 
-        The first chord begins at ``start``, off the surface on which ``p`` lies.
+        The first chord begins at ``start``, off the surface on which ``p`` lies. Nothing is
+        skipped, however ``far`` rays go.
         """
         return self._follow(p, v, start, reach, active, time, True).valid
 

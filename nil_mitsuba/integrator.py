@@ -22,6 +22,12 @@ from .tracer import Cone, Tracer
 ROUGH_SPREAD = 0.8
 # A lobe narrower than this (radians) is a mirror's for the tracer: hits stay exact behind it.
 SOFT_LOBE = 0.1
+# Behind a rough bounce, the part of a ray's spread by which the next ray's error grows: lobes blur
+# what lies behind them, not the contact that the next ray starts from.
+WIDENING = 0.25
+# Towards a light a ray may be off by the angle that a rough bounce would allow it, times so many
+# half angles of the light: the shadow's edge is as wide as the light.
+PENUMBRA = 3
 
 
 # A shadow ray ends this part of its length before the light. Mitsuba's own part is ten times as
@@ -194,7 +200,8 @@ class NilIntegrator(ADIntegrator):
             # Continue tracing the path at this point?
             active_next = (depth + 1 < depth_limit) & si.is_valid()
             bsdf = si.bsdf()
-            width = dr.fma(cone.spread, hit.distance, cone.width)
+            growth = dr.select(cone.soft, WIDENING, 1) * cone.spread
+            width = dr.fma(growth, hit.distance, cone.width)
 
             # --------------------- Emitter sampling ---------------------
 
@@ -219,7 +226,10 @@ class NilIntegrator(ADIntegrator):
                 mis_em = dr.select(light.delta, 1, mis_weight(light.pdf, bsdf_pdf))
                 Lr_dir = β * bsdf_val * light.weight * mis_em
                 active_em &= dr.any(Lr_dir != 0)
-                spread = dr.select(light.delta, cone.spread, view.rough_spread)
+                lobe = dr.select(light.delta, 0,
+                                 dr.minimum(PENUMBRA * lobe_angle(light.pdf), 1))
+                spread = dr.select(cone.soft, view.rough_spread,
+                                   dr.maximum(cone.spread, view.rough_spread * lobe))
                 active_em &= self._visible(view, si, light, Cone(width, spread), active_em)
                 L += dr.select(active_em, Lr_dir, 0)
 
@@ -239,7 +249,7 @@ class NilIntegrator(ADIntegrator):
             spent = mi.Float(0)
 
             # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
-            lobe = dr.minimum(dr.rsqrt(dr.pi * dr.maximum(bsdf_sample.pdf, 1e-8)), 1)
+            lobe = dr.minimum(lobe_angle(bsdf_sample.pdf), 1)
             cone.width = width
             cone.soft |= active_next & ~bsdf_delta_prev & (lobe > SOFT_LOBE)
             cone.spread = dr.select(
@@ -272,7 +282,8 @@ class NilIntegrator(ADIntegrator):
         reach = light.distance * (1 - SHADOW_EPSILON)
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))
-        return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time)
+        return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time,
+                                view.lights.has_infinite)
 
     @dr.syntax
     def _beyond_lights(self, view, time, p, v, cone, active):
@@ -292,6 +303,11 @@ class NilIntegrator(ADIntegrator):
                                    cone.width)
             spent = dr.select(active, spent + hit.distance, spent)
         return p, v, cone, spent
+
+
+def lobe_angle(pdf):
+    """Half angle (radians) of a cone in which directions of solid-angle density ``pdf`` lie."""
+    return dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-8))
 
 
 def mis_weight(pdf_a, pdf_b):
