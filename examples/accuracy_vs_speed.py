@@ -836,7 +836,7 @@ def main_chart(alt, rows):
         layers = curves(alt, data, "processor time per ray (µs)", title, 360, 330)
         default = next(d for d in data if d["default"])
         label = alt.Chart(alt.Data(values=[default])).mark_text(
-            text="default", dx=4, dy=16, align="left", fontSize=13, fontWeight="bold",
+            text="default", dx=-6, dy=16, align="right", fontSize=13, fontWeight="bold",
         ).encode(alt.X("time:Q"), alt.Y("value:Q"))
         panels.append(alt.layer(*layers, label))
     count = max(row["rays"] for row in rows)
