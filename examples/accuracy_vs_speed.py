@@ -969,10 +969,10 @@ def main():
             if main and length == MAIN["length"]:
                 rows += measure(rays, length, 1 if quick else 2, 2000)
             else:
-                rows += measure(rays, length, 1, 700)
+                rows += measure(rays, length, 1, 300)
         report(f"traced: {setup.kind}, {setup.space}", began)
     lengths = (5,) if quick else (5, 1, 20)
-    end_rows = end_points(lengths, 1 if quick else 3, quick)
+    end_rows = end_points(lengths, 1 if quick else 2, quick)
     if not quick:
         end_rows += heyoka_rows(lengths)
     report("end points: done", began)
@@ -981,7 +981,7 @@ def main():
         if quick and (setup.kind, setup.space) != ("sparse", "plain"):
             continue
         found = (images(setup, IMAGE_KNOBS[-2:], 32, 24, 1, (1, 2, 4), 4) if quick
-                 else images(setup, IMAGE_KNOBS, 80, 60, 8, (1, 4, 8), 128))
+                 else images(setup, IMAGE_KNOBS, 80, 60, 8, (1, 2, 4), 128))
         image_rows += found[0]
         differences += found[1]
         report(f"rendered: {setup.kind}, {setup.space}", began)
