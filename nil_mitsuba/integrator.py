@@ -11,7 +11,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
-from .lights import Lights
+from .lights import Lights, lobe_angle
 from .passes import COUNT_LAYERS, LAYERS, MEAN_LAYERS, Passes, layer_channels
 from .quotient import Space, multiply_cells, shape_box
 from .tracer import Cone, Tracer
@@ -226,10 +226,9 @@ class NilIntegrator(ADIntegrator):
                 mis_em = dr.select(light.delta, 1, mis_weight(light.pdf, bsdf_pdf))
                 Lr_dir = β * bsdf_val * light.weight * mis_em
                 active_em &= dr.any(Lr_dir != 0)
-                lobe = dr.select(light.delta, 0,
-                                 dr.minimum(PENUMBRA * lobe_angle(light.pdf), 1))
+                penumbra = dr.minimum(PENUMBRA * light.angle, 1)
                 spread = dr.select(cone.soft, view.rough_spread,
-                                   dr.maximum(cone.spread, view.rough_spread * lobe))
+                                   dr.maximum(cone.spread, view.rough_spread * penumbra))
                 active_em &= self._visible(view, si, light, Cone(width, spread), active_em)
                 L += dr.select(active_em, Lr_dir, 0)
 
@@ -303,11 +302,6 @@ class NilIntegrator(ADIntegrator):
                                    cone.width)
             spent = dr.select(active, spent + hit.distance, spent)
         return p, v, cone, spent
-
-
-def lobe_angle(pdf):
-    """Half angle (radians) of a cone in which directions of solid-angle density ``pdf`` lie."""
-    return dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-8))
 
 
 def mis_weight(pdf_a, pdf_b):

@@ -31,18 +31,26 @@ class LightSample:
 
     ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
     it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with
-    respect to solid angle, 0 for ``delta`` light, which no other technique finds.
+    respect to solid angle, 0 for ``delta`` light, which no other technique finds; ``angle``: half
+    angle (radians) of the light that this image of it shows the receiver, 0 for ``delta`` light.
     """
 
     DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum,
-                    "pdf": mi.Float, "delta": mi.Bool}
+                    "pdf": mi.Float, "delta": mi.Bool, "angle": mi.Float}
 
-    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None):
+    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None,
+                 angle=None):
         self.direction = direction
         self.distance = distance
         self.weight = weight
         self.pdf = pdf
         self.delta = delta
+        self.angle = angle
+
+
+def lobe_angle(pdf):
+    """Half angle (radians) of a cone in which directions of solid-angle density ``pdf`` lie."""
+    return dr.rsqrt(dr.pi * dr.maximum(pdf, 1e-8))
 
 
 class Images:
@@ -265,7 +273,8 @@ class Lights:
         ds, weight = emitter.sample_direction(si, u, active)
         return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf),
                            dr.select(ds.pdf > 0, weight, 0),
-                           dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta))
+                           dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta),
+                           dr.select(ds.delta, 0, lobe_angle(ds.pdf)))
 
     def _image_of(self, p, q, u1, u2):
         """An image (cells) of the point ``q`` of the unit cube, and its probability."""
@@ -297,11 +306,13 @@ class Lights:
         at_light.wi = mi.Vector3f(0, 0, 1)
         radiance = emitter.eval(at_light, active)
         density = way.area_density * dr.square(space.size)  # scene units
-        pdf = probability * density / (area * stretch * cosine)
+        density /= area * stretch * cosine
+        pdf = probability * density
         reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
         pdf = dr.select(reached, pdf, 0)
         return LightSample(direction, way.distance,
-                           dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False))
+                           dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False),
+                           lobe_angle(density))
 
     def _sample_point(self, emitter, q, si, p, u, u1, u2, active):
         space = self.space
@@ -336,7 +347,7 @@ class Lights:
         density = dr.abs(density) * dr.square(space.size)
         reached = active & (density > 0) & (distance <= self.max_distance) & (ds.pdf > 0)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True))
+        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
 
