@@ -16,7 +16,7 @@ import mitsuba as mi
 from . import geometry
 from .quotient import Space, exit_through_face, opaque, scene_box, through_face
 
-# A chord's sagitta is at most this part of the cone's width there: along rays that are seen, behind
+# A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
 # rough bounces, and towards lights. What a chord has missed cannot be found again, while what it
 # has met by mistake can, so the error is one-sided: an image's mean allows less than its edges do.
 # On the bent Cornell box (examples/speed.py) twice as much in the place of one of them moves the
@@ -292,7 +292,8 @@ class Tracer:
             while searching:
                 fresh = redo | (t0 >= t1)
                 # At least a few roundings of the length, so that every chord moves on
-                h = dr.maximum(dr.minimum(stretch * chords.after(t0), cap), 2**-21 * t0)
+                h = dr.minimum(stretch * chords.after(t0), dr.minimum(cap, bend.longest))
+                h = dr.maximum(h, 2**-21 * t0)
                 wanted = mi.Float(h)
                 empty = mi.Bool(False)
                 if not quotient:
@@ -416,6 +417,7 @@ class Tracer:
         while active:
             fresh = t0 >= t1
             h = dr.maximum(chords.between(t0, reach - t0), 2**-21 * t0)
+            wanted = mi.Float(h)
             empty = mi.Bool(False)
             if far and not quotient:
                 skip = dr.minimum(self.outside(vertex, direction, bend), bend.longest)
@@ -428,7 +430,7 @@ class Tracer:
             # Corners off the curve: secants would meet what is on its inner side, and only that.
             # Two chords whose ends stay on it are right on average with 4/3 of the sagitta. Near
             # the light they keep to the curve, not to reach behind it.
-            lift = dr.minimum((4 / 3) * 0.125 * dr.square(h),
+            lift = dr.minimum((4 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h)),
                               0.2 * chords.room(reach - t1) / bend.across)
             corner = dr.fma(dr.select(last, 0, -lift), self.acceleration(base, direction), base)
             end = dr.select(fresh, corner, end)

