@@ -14,10 +14,11 @@ import tempfile
 import time
 from statistics import NormalDist
 
+import nil_mitsuba  # noqa: F401 - before mitsuba and drjit: it chooses LLVM
+
+# isort: split
 import drjit as dr
 import mitsuba as mi
-
-import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses LLVM
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -234,7 +235,7 @@ if __name__ == "__main__":
     else:
         memory()
         first_render()
-        against_path(128, 256, 7)
+        against_path(128, 256, 5)
         pixels_off(128, 1024)
         against_triangles((1_000, 10_000, 100_000, 1_000_000))
         against_straight(240_000, 32, 5)

@@ -3,11 +3,13 @@ import pathlib
 import subprocess
 import sys
 
-import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.Jit will use
+ENVIRONMENT = dict(os.environ)  # a user's, before the package has chosen an LLVM for this process
+
+import nil_mitsuba  # noqa: E402, F401 - before mitsuba: it chooses the LLVM that Dr.Jit will use
 
 # isort: split
-import mitsuba as mi
-import pytest
+import mitsuba as mi  # noqa: E402
+import pytest  # noqa: E402
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

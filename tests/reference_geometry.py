@@ -8,6 +8,9 @@ from functools import cache
 from itertools import product
 from math import hypot, inf, pi, sqrt
 
+import nil_mitsuba  # noqa: F401 - before drjit: it chooses LLVM
+
+# isort: split
 import drjit as dr
 from mpmath import mp, mpf
 

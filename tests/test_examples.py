@@ -5,13 +5,13 @@ import sys
 import drjit as dr
 import pytest
 
-from conftest import ROOT
+from conftest import ENVIRONMENT, ROOT
 
 
 def run(program, *arguments):
     """Run a program of examples/; the one line it prints last."""
     result = subprocess.run([sys.executable, str(ROOT / "examples" / program), *arguments],
-                            capture_output=True, text=True, timeout=300)
+                            capture_output=True, text=True, timeout=300, env=ENVIRONMENT)
     assert result.returncode == 0, result.stderr
     return result.stdout.splitlines()[-1]
 

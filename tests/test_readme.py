@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from conftest import ENVIRONMENT
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
@@ -49,7 +51,8 @@ def desk(tmp_path_factory):
 
 
 def run(desk, arguments):
-    result = subprocess.run(arguments, cwd=desk, capture_output=True, text=True, timeout=600)
+    result = subprocess.run(arguments, cwd=desk, capture_output=True, text=True, timeout=600,
+                            env=ENVIRONMENT)
     assert result.returncode == 0, f"{shlex.join(map(str, arguments))}\n{result.stderr[-2000:]}"
 
 

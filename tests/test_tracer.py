@@ -1,5 +1,8 @@
 """Single rays of the tracer against float64 root finding that shares no code with it."""
 
+import nil_mitsuba  # noqa: F401 - before drjit: it chooses LLVM
+
+# isort: split
 import drjit as dr
 import pytest
 from drjit.llvm import Array3f64, Array3i
@@ -170,8 +173,6 @@ def test_ten_million_random_rays_end(rgb, twist):
 
 if __name__ == "__main__":
     import mitsuba
-
-    import nil_mitsuba  # noqa: F401
 
     mitsuba.set_variant("llvm_ad_rgb")
     print("scene     twist  tolerance  far from silhouettes  near them  error / allowance")
