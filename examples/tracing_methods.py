@@ -4,7 +4,8 @@ All of them cut the geodesic into chords, search each chord for a surface with E
 chords through the glued faces of the cube as the package does; they have its ``intersect`` and
 ``occluded``. They differ in how the next point of the geodesic is found and how far it is away.
 They exist for the chart (``accuracy_vs_speed.py``) and the table of failures (``failures.py``).
-Points are in cells and directions in frame components. Set a Mitsuba variant before this module is imported.
+Points are in cells and directions in frame components. Set a Mitsuba variant before this module
+is imported.
 """
 
 from __future__ import annotations
