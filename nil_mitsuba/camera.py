@@ -1,9 +1,10 @@
 """Where a Mitsuba sensor's rays start in Nil, in which direction, and how exact they must be.
 
 A sensor's rotation is read as frame components at its own position, so its rays' directions need
-no change. What Mitsuba adds to the position (near clip, film plane, lens) is a coordinate vector δ
-that is applied by the group product o·δ, which makes a camera's view the same wherever a left
-translation takes it.
+no change. What moves a ray's origin across its direction (film plane, lens) is a coordinate vector
+δ that is applied by the group product o·δ, which makes a camera's view the same wherever a left
+translation takes it. The clip planes are arc lengths along the ray's own geodesic: they hide, and
+never move, what is seen.
 """
 
 from __future__ import annotations
@@ -37,70 +38,95 @@ class Camera:
         self.space = space
         self.tolerance = dr.opaque(mi.Float, tolerance)
         self.thinlens = name == "ThinLensCamera"
-        film = sensor.film()
-        self.first_column = film.crop_offset().x
 
         parameters = mi.traverse(sensor)
         if name == "BatchSensor":
             # A batch lists its children's parameters behind their names.
-            children = [key[: -len(".shutter_open")] for key in parameters.keys()
+            children = [key[: -len("shutter_open")] for key in parameters.keys()
                         if key.endswith(".shutter_open")]
             for child in children:
-                turned = f"{child}.to_world" in parameters
-                if not turned or f"{child}.aperture_radius" in parameters:
+                turned = f"{child}to_world" in parameters
+                if not turned or f"{child}aperture_radius" in parameters:
                     raise RuntimeError(
                         f'the integrator "nil" renders perspective and orthographic sensors inside '
-                        f'a batch, and "{child}" is neither: render it as a sensor of its own.'
+                        f'a batch, and "{child[:-1]}" is neither: render it as a sensor of its own.'
                     )
-            transforms = [mi.Transform4f(parameters[f"{child}.to_world"]) for child in children]
-            self.origins = [opaque(mi.Point3f(t @ mi.Point3f(0))) for t in transforms]
-            self.columns = film.size().x // len(children)
+            self.views = [_Frustum(parameters, child) for child in children]
         else:
-            transform = sensor.world_transform()
-            self.origins = [opaque(mi.Point3f(transform @ mi.ScalarPoint3f(0)))]
-            self.axis = opaque(dr.normalize(mi.Vector3f(transform @ mi.Vector3f(0, 0, 1))))
+            self.views = [_Frustum(parameters, "", sensor.world_transform())]
         if self.thinlens:
             self.focus_distance = opaque(mi.Float(parameters["focus_distance"]))
-            self.near_clip = opaque(mi.Float(parameters["near_clip"]))
 
-    def start(self, ray: mi.RayDifferential3f, position: mi.Vector2f
-              ) -> tuple[mi.Point3f, mi.Vector3f, Cone]:
-        """Start (cells), frame direction and error cone of a sensor ray (scene).
+    def start(self, ray: mi.RayDifferential3f, across: mi.Float
+              ) -> tuple[mi.Point3f, mi.Vector3f, Cone, mi.Float]:
+        """Start (cells), frame direction, error cone and length (cells) of a sensor ray (scene).
 
-        ``position`` is the sample's place on the film in pixels; a batch tells its sensors apart
-        by it.
+        ``across``: the sample's place on the film from its left (0) to its right (1); a batch tells
+        its sensors apart by it.
         """
         space = self.space
-        origin = mi.Point3f(self.origins[0])
-        for i, other in enumerate(self.origins[1:], start=1):
-            origin = dr.select(position.x >= i * self.columns, other, origin)
+        origin, near = self._view(ray, across)
 
+        # Mitsuba's clip planes are across the axis, and both bound the way along the geodesic.
+        on_plane = mi.Vector3f((ray.o - near * ray.d) - origin)
+        near /= space.size
+        far = ray.maxt / space.size
         if ray.has_differentials:
             # The narrower side of a pixel bounds the error.
-            cone = Cone(
-                self.tolerance / space.size * dr.minimum(dr.norm(ray.o_x - ray.o),
-                                                         dr.norm(ray.o_y - ray.o)),
-                self.tolerance * dr.minimum(dr.norm(ray.d_x - ray.d), dr.norm(ray.d_y - ray.d)),
-            )
+            spread = self.tolerance * dr.minimum(dr.norm(ray.d_x - ray.d),
+                                                 dr.norm(ray.d_y - ray.d))
+            width = self.tolerance / space.size * dr.minimum(dr.norm(ray.o_x - ray.o),
+                                                             dr.norm(ray.o_y - ray.o))
+            cone = Cone(dr.fma(spread, near, width), spread)
         else:
             cone = Cone(0, self.tolerance * 1e-3)  # a single ray: as in an image 1,000 pixels wide
 
         p, v = space.to_cells(origin), mi.Vector3f(ray.d)
         if self.thinlens:
-            p, v = self._through_lens(p, origin, ray)
+            p, v = self._through_lens(p, on_plane, ray)
         else:
-            p = geometry.multiply(p, mi.Point3f((ray.o - origin) / space.size), space.twist)
-        return p, v, cone
+            p = geometry.multiply(p, mi.Point3f(on_plane / space.size), space.twist)
+        p, v = geometry.flow(p, v, near, space.twist)
+        return p, v, cone, far
 
-    def _through_lens(self, pinhole, origin, ray):
+    def _view(self, ray, across):
+        """Origin of the sensor that a ray is from, and the way to its near clip plane (scene)."""
+        origin, near = self.views[0].origin, self.views[0].near_of(ray)
+        for i, view in enumerate(self.views[1:], start=1):
+            mine = dr.minimum(mi.UInt32(across * len(self.views)), len(self.views) - 1) >= i
+            origin = dr.select(mine, view.origin, origin)
+            near = dr.select(mine, view.near_of(ray), near)
+        return origin, near
+
+    def _through_lens(self, pinhole, on_lens, ray):
         """The ray from a point of the lens to where the pinhole's geodesic is in focus."""
         space, k = self.space, self.space.twist
-        depth = dr.dot(ray.d, self.axis)
-        near = self.near_clip / depth
-        on_lens = (ray.o - near * ray.d) - origin
-        to_focus = on_lens + (self.focus_distance / depth) * ray.d
+        to_focus = on_lens + self.focus_distance / self.views[0].depth(ray) * ray.d
         length = dr.norm(to_focus)
         focus, _ = geometry.flow(pinhole, mi.Vector3f(to_focus / length), length / space.size, k)
         lens = geometry.multiply(pinhole, mi.Point3f(on_lens / space.size), k)
-        v = mi.Vector3f(geometry.connect(lens, focus, k).direction)
-        return geometry.flow(lens, v, near / space.size, k)
+        return lens, mi.Vector3f(geometry.connect(lens, focus, k).direction)
+
+
+class _Frustum:
+    """Where one sensor is, and how far from it its rays begin."""
+
+    def __init__(self, parameters, prefix, transform=None):
+        if transform is None:
+            transform = mi.Transform4f(parameters[f"{prefix}to_world"])
+        self.origin = opaque(mi.Point3f(transform @ mi.Point3f(0)))
+        axis = mi.Vector3f(transform @ mi.Vector3f(0, 0, 1))
+        self.axis = opaque(dr.normalize(axis))
+        near = f"{prefix}near_clip"
+        self.near = opaque(mi.Float(parameters[near] if near in parameters else 0))
+        # An orthographic sensor's film may be scaled, and its rays are parallel.
+        self.parallel = near in parameters and f"{prefix}x_fov" not in parameters
+        self.scale = opaque(dr.norm(axis))
+
+    def depth(self, ray):
+        """How far a ray goes along the axis by a unit of its length."""
+        return dr.dot(ray.d, self.axis)
+
+    def near_of(self, ray):
+        """How far along a ray the near clip plane is."""
+        return self.near * self.scale if self.parallel else self.near / self.depth(ray)

@@ -116,11 +116,11 @@ class NilIntegrator(ADIntegrator):
                                  "are traced straight.")
         view = View(scene, self)
         camera = Camera(scene.sensors()[0], view.space, self.tolerance)
-        p, v, cone = camera.start(ray, mi.Vector2f(0))
+        p, v, cone, far = camera.start(ray, mi.Float(0))
         # Wrappers shrink the differentials with the sample count; the cone is a whole pixel's.
         scale = math.sqrt(sampler.sample_count())
         cone = Cone(cone.width * scale, cone.spread * scale)
-        radiance, valid, seen = self.trace(view, sampler, ray, p, v, cone, mi.Bool(active))
+        radiance, valid, seen = self.trace(view, sampler, ray, p, v, cone, far, mi.Bool(active))
         # What is not seen in the scene is the number of samples: this one
         aovs = [mi.Float(channel) for layer in self.layers for channel in seen.get(layer, [1])]
         return radiance, valid, aovs, None
@@ -139,11 +139,12 @@ class NilIntegrator(ADIntegrator):
 
     @dr.syntax
     def trace(self, view: View, sampler: mi.Sampler, ray: mi.RayDifferential3f, p: mi.Point3f,
-              v: mi.Vector3f, cone: Cone, active: mi.Bool):
+              v: mi.Vector3f, cone: Cone, far: mi.Float, active: mi.Bool):
         """Radiance along the geodesics from ``p`` (cells) in frame direction ``v``.
 
-        Returns the radiance, whether the path met anything that makes its pixel opaque, and the
-        channels of each layer at the path's first vertex.
+        What lies beyond the length ``far`` (cells) is hidden from the camera. Returns the radiance,
+        whether the path met anything that makes its pixel opaque, and the channels of each layer at
+        the path's first vertex.
         """
         scene, space, tracer = view.scene, view.space, view.tracer
         lights = view.lights
@@ -168,10 +169,11 @@ class NilIntegrator(ADIntegrator):
         bsdf_pdf_prev   = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
         spent           = mi.Float(0)          # Length of the camera segment before hidden lights
+        far             = dr.minimum(far, tracer.max_distance)
         seen            = view.nothing_seen()  # Layers
 
         if self.hide_emitters:
-            p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, active)
+            p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, far, active)
 
         while active:
             # --------------------- The next vertex ---------------------
@@ -179,7 +181,8 @@ class NilIntegrator(ADIntegrator):
             home = mi.Vector3i(0)
             if space.quotient:
                 p, home = geometry.wrap(p, space.twist)
-            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, spent), active, ray.time)
+            limit = dr.select(depth == 0, far - spent, tracer.max_distance)
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, limit), active, ray.time)
             si = surface_interaction(hit, v, space, ray.wavelengths)
 
             seen = view.see(seen, hit, si, home, spent, active & (depth == 0))
@@ -245,7 +248,6 @@ class NilIntegrator(ADIntegrator):
             vertex_prev = space.to_cells(si.p)
             bsdf_pdf_prev = bsdf_sample.pdf
             bsdf_delta_prev = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-            spent = mi.Float(0)
 
             # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
             lobe = dr.minimum(lobe_angle(bsdf_sample.pdf), 1)
@@ -285,7 +287,7 @@ class NilIntegrator(ADIntegrator):
                                 view.lights.has_infinite)
 
     @dr.syntax
-    def _beyond_lights(self, view, time, p, v, cone, active):
+    def _beyond_lights(self, view, time, p, v, cone, far, active):
         """Where a camera ray goes on behind the area lights that it meets first."""
         space, tracer = view.space, view.tracer
         spent = mi.Float(0)
@@ -293,7 +295,7 @@ class NilIntegrator(ADIntegrator):
         while active:
             if space.quotient:
                 p = mi.Point3f(geometry.wrap(p, space.twist)[0])
-            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, spent), active, time)
+            hit = tracer.intersect(p, v, cone, tracer.reach(p, v, far - spent), active, time)
             si = surface_interaction(hit, v, space, mi.Color0f())
             active &= hit.valid & (si.shape.emitter() != None)  # noqa: E711
             p = dr.select(active, offset(si.p, si.n, hit.arrival, space), p)

@@ -155,9 +155,9 @@ class Passes:
         sampler = self.sampler.clone()
         # Opaque, so that one kernel does for all passes and bands
         sampler.seed(dr.opaque(mi.UInt32, pass_seed(self.seed, index)), self.band * self.spp)
-        number, inside, ray, weight, position = self._sample_rays(sampler, first)
-        p, v, cone = self.camera.start(ray, position)
-        radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, p, v, cone, inside)
+        number, inside, ray, weight, position, across = self._sample_rays(sampler, first)
+        start = self.camera.start(ray, across)
+        radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, inside)
         ADIntegrator._splat_to_block(
             block, self.film, position,
             value=dr.select(inside, radiance * weight, 0),
@@ -166,7 +166,7 @@ class Passes:
             aovs=self._channels(seen, MEAN_LAYERS), wavelengths=ray.wavelengths,
         )
         channels = self._channels(seen, POINT_LAYERS)
-        del sampler, ray, weight, position, p, v, cone, radiance, valid, seen, inside
+        del sampler, ray, weight, position, across, start, radiance, valid, seen, inside
         # Together: what is evaluated later would be traced again
         dr.eval(block.tensor(), [number, *channels] if channels else [])
         if channels:
@@ -204,14 +204,12 @@ class Passes:
         if sensor.shutter_open_time() > 0:
             time += sampler.next_1d() * sensor.shutter_open_time()
         wavelength = sampler.next_1d() if mi.is_spectral else 0
-        ray, weight = sensor.sample_ray_differential(
-            time, wavelength,
-            dr.fma(position, scale, -mi.ScalarVector2f(film.crop_offset()) * scale), aperture,
-        )
+        on_film = dr.fma(position, scale, -mi.ScalarVector2f(film.crop_offset()) * scale)
+        ray, weight = sensor.sample_ray_differential(time, wavelength, on_film, aperture)
         # Under a box filter a sample belongs to its pixel whatever rounding says
         if film.rfilter().is_box_filter():
             position = mi.Vector2f(place)
-        return number, inside, ray, weight, position
+        return number, inside, ray, weight, position, on_film.x
 
     def _channels(self, seen, of):
         return [channel for layer in of if layer in self.layers for channel in seen[layer]]

@@ -165,17 +165,19 @@ class Tracer:
 
     # ------------------------------------------------------------------ lengths
 
-    def reach(self, p: mi.Point3f, v: mi.Vector3f, spent: mi.Float = 0) -> mi.Float:
+    def reach(self, p: mi.Point3f, v: mi.Vector3f, limit: mi.Float | None = None) -> mi.Float:
         """Arc length (cells) past which the geodesic cannot meet the scene's box any more.
 
-        At most ``max_distance``, less what is ``spent`` of it.
+        At most ``limit``, which is ``max_distance`` if it is None.
 
         With B and H the horizontal and symmetric-vertical extent of the box seen from p, a point
         inside has |Z~| ≤ H and horizontal distance ≤ B, while |Z~| ≥ (|w| + c²/2|w|) t − c B/2|w|
         along the geodesic; hence t ≤ (2 |w| H + c B)/(1 + w²).
         """
+        if limit is None:
+            limit = self.max_distance
         if self.space.quotient:
-            return self.max_distance - spent
+            return limit
         far = dr.maximum(dr.abs(self.lower - p), dr.abs(self.upper - p))
         k = dr.abs(self.space.twist)
         c = dr.hypot(v.x, v.y)
@@ -183,7 +185,7 @@ class Tracer:
         height = far.z + k * far.y * (dr.abs(p.x) + 0.5 * far.x)
         bound = (2 * w * height + c * dr.hypot(far.x, far.y)) / (1 + w * w)
         # one part in a thousand and a little more against rounding
-        return dr.minimum(1.001 * bound + 1e-3, self.max_distance - spent)
+        return dr.minimum(1.001 * bound + 1e-3, limit)
 
     @dr.syntax
     def outside(self, p: mi.Point3f, v: mi.Vector3f, bend: Bend) -> mi.Float:
