@@ -283,8 +283,7 @@ class NilIntegrator(ADIntegrator):
         reach = light.distance * (1 - SHADOW_EPSILON)
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))
-        return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time,
-                                view.lights.has_infinite)
+        return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time)
 
     @dr.syntax
     def _beyond_lights(self, view, time, p, v, cone, far, active):

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
+from .box import Box, Passage
 from .quotient import Space, exit_through_face, opaque, scene_box, through_face
 
 # A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
@@ -160,8 +161,8 @@ class Tracer:
         box = scene_box(scene)
         if not box.valid():  # a scene of environment emitters only
             box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
-        self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
-        self.upper = space.to_cells(opaque(mi.Point3f(box.max)))
+        self.box = Box(space.to_cells(opaque(mi.Point3f(box.min))),
+                       space.to_cells(opaque(mi.Point3f(box.max))))
 
     # ------------------------------------------------------------------ lengths
 
@@ -178,7 +179,7 @@ class Tracer:
             limit = self.max_distance
         if self.space.quotient:
             return limit
-        far = dr.maximum(dr.abs(self.lower - p), dr.abs(self.upper - p))
+        far = dr.maximum(dr.abs(self.box.lower - p), dr.abs(self.box.upper - p))
         k = dr.abs(self.space.twist)
         c = dr.hypot(v.x, v.y)
         w = dr.abs(v.z)
@@ -188,32 +189,38 @@ class Tracer:
         return dr.minimum(1.001 * bound + 1e-3, limit)
 
     @dr.syntax
-    def outside(self, p: mi.Point3f, v: mi.Vector3f, bend: Bend) -> mi.Float:
-        """Arc length (cells) that certainly does not meet the scene's box; 0 inside it."""
-        length = mi.Float(0)
-        below, above = self.lower - p, p - self.upper
-        if dr.any((below > 0) | (above > 0)):  # a branch: most rays are inside
-            # A little less, or rounding takes the ray behind what lies on the box
-            length = 0.999 * self._back_at(p, v, bend, below, above)
-        return length
+    def _approach(self, p: mi.Point3f, v: mi.Vector3f, chords: Chords, stretch: mi.Float,
+                  vertex: mi.Point3f, base: mi.Point3f, direction: mi.Vector3f, t: mi.Float,
+                  reach: mi.Float, active: mi.Bool):
+        """Pass what is empty before the scene's box, if ``vertex`` (at arc length t) is outside.
 
-    def _back_at(self, p, v, bend, below, above):
-        """Arc length before which a geodesic from outside of the box cannot meet it.
-
-        A coordinate that is off the box by g and moves away at speed u is not back as long as
-        g + u t − M t²/2 > 0, where M bounds its acceleration.
+        Returns the vertex, the geodesic's point and direction there and their arc length (cells),
+        which is ``reach`` where the geodesic does not come (back) to the box before.
         """
-        velocity = geometry.from_frame(p, v, self.space.twist)
-        # |z''| = |k a b + k² x w a|, in which |x| grows by less than 1/k before t = 1/k
-        rise = dr.fma(bend.turn, dr.fma(bend.k, dr.abs(p.x), 1), 0.5 * bend.k * bend.c2)
-        lengths = []
-        for i, most in enumerate((bend.turn, bend.turn, rise)):
-            gap = dr.maximum(below[i], above[i])
-            away = dr.select(above[i] > 0, velocity[i], -velocity[i])
-            root = dr.sqrt(dr.maximum(dr.fma(away, away, 2 * most * gap), 0))
-            length = dr.select(away > 0, (away + root) / most, 2 * gap / (root - away))
-            lengths.append(dr.select(gap > 0, length, 0))
-        return dr.maximum(dr.maximum(lengths[0], lengths[1]), dr.minimum(lengths[2], bend.longest))
+        leaping = active & self.box.excludes(vertex)
+        if leaping:  # a branch: most rays are inside
+            passage = Passage(p, v, self.space.twist)
+            start = mi.Float(t)
+            while leaping:
+                free = self.box.clearance(base, direction, passage)
+                leaping &= free > stretch * chords.after(t)
+                t = dr.select(leaping, dr.minimum(t + free, reach), t)
+                leaping &= t < reach
+                point, arrival = geometry.flow(p, v, t, self.space.twist)
+                base = dr.select(leaping, point, base)
+                direction = dr.select(leaping, arrival, direction)
+            # As lifted as after a chord
+            lift = self._lift(stretch * chords.after(t))
+            lifted = dr.fma(lift, self.acceleration(base, direction), base)
+            vertex = dr.select(t > start, lifted, vertex)
+        return vertex, base, direction, t
+
+    def _lift(self, h):
+        """How far a chord's end is moved by the acceleration there, for chords of length ``h``.
+
+        The corners lie outside the curve by 2/3 of the sagitta: the mean error is zero.
+        """
+        return -(2 / 3) * 0.125 * dr.square(h)
 
     def acceleration(self, p: mi.Point3f, v: mi.Vector3f) -> mi.Vector3f:
         """Second derivative of the geodesic's coordinates: k (−w b, w a, a b + k x w a)."""
@@ -269,13 +276,9 @@ class Tracer:
         # The chord in work runs from ``vertex`` (at arc length t0, on the last chord) to ``end``;
         # ``base`` is the geodesic's point at t1, where it has ``direction``. ``cap`` shortens
         # chords after a failed refinement.
-        t0 = mi.Float(0)
+        t0, t1 = mi.Float(0), mi.Float(0)
         base, direction = mi.Point3f(p), mi.Vector3f(v)
-        if not quotient:
-            t0 = self.outside(p, v, bend)
-            if t0 > 0:  # few do
-                base, direction = geometry.flow(p, v, t0, k)
-        vertex, end, t1 = mi.Point3f(base), mi.Point3f(base), mi.Float(t0)
+        vertex, end = mi.Point3f(p), mi.Point3f(p)
         # ``scale`` is the longer of this chord and the last: both ends may be off by its sagitta.
         length, scale = mi.Float(0), mi.Float(0)
         cap = mi.Float(dr.inf)
@@ -286,31 +289,28 @@ class Tracer:
         distance = mi.Float(dr.inf)
         o, d = mi.Point3f(0), mi.Vector3f(0)
         found = dr.zeros(mi.PreliminaryIntersection3f)
-        active = active & (t0 < reach)
+        active = active & (reach > 0)
 
         while active:
             # -------------- Along chords, until one meets something --------------
             searching = mi.Bool(active)
             while searching:
                 fresh = redo | (t0 >= t1)
+                if not quotient:
+                    vertex, base, direction, t0 = self._approach(
+                        p, v, chords, stretch, vertex, base, direction, t0, reach,
+                        searching & fresh & ~redo)
+                    t1 = dr.select(redo, t1, t0)
                 # At least a few roundings of the length, so that every chord moves on
                 h = dr.minimum(stretch * chords.after(t0), dr.minimum(cap, bend.longest))
                 h = dr.maximum(h, 2**-21 * t0)
-                wanted = mi.Float(h)
-                empty = mi.Bool(False)
-                if not quotient:
-                    skip = dr.minimum(self.outside(vertex, direction, bend), bend.longest)
-                    empty = fresh & ~redo & (skip > h)
-                    h = dr.maximum(h, skip)
                 # A second look starts on the geodesic itself: a step sideways leads there.
                 h = dr.select(redo, 0, dr.minimum(h, reach - t0))
                 ahead = dr.select(fresh, t0 + h - t1, 0)
                 base, direction = geometry.short_flow(base, v, t1, ahead, k)
                 t1 = dr.select(fresh, t0 + h, t1)
-                # The corners lie outside the curve by 2/3 of the sagitta: the mean error is zero.
-                lift = -(2 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h))
                 end = dr.select(
-                    fresh, dr.fma(lift, self.acceleration(base, direction), base), end)
+                    fresh, dr.fma(self._lift(h), self.acceleration(base, direction), base), end)
                 scale = dr.select(fresh, dr.maximum(h, length), scale)
                 length = dr.select(fresh, h, length)
                 cap = dr.select(fresh & ~redo, 2 * cap, cap)
@@ -321,7 +321,7 @@ class Tracer:
                 ray = line_ray(o, d, time,
                                dr.fma(s_last, speed, before + space.slack) * space.size)
                 found = scene.ray_intersect_preliminary(ray, coherent=False,
-                                                        active=searching & ~empty)
+                                                        active=searching & (t0 < reach))
                 there = found.is_valid()
                 through = ~there & leaves
                 # Where something was met, the chord stays as it is
@@ -397,13 +397,11 @@ class Tracer:
 
     @dr.syntax
     def occluded(self, p: mi.Point3f, start: mi.Point3f, v: mi.Vector3f, cone: Cone,
-                 reach: mi.Float, active: mi.Bool, time: mi.Float = 0,
-                 far: bool = True) -> mi.Bool:
+                 reach: mi.Float, active: mi.Bool, time: mi.Float = 0) -> mi.Bool:
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach`` (cells).
 
         The first chord begins at ``start``: off the surface on which ``p`` lies, while the last one
-        ends where the geodesic does. In the quotient ``start`` lies in the unit cube. ``far``: some
-        rays leave the scene, and what is empty around it is to be skipped.
+        ends where the geodesic does. In the quotient ``start`` lies in the unit cube.
         """
         space, scene = self.space, self.scene
         k = space.twist
@@ -418,13 +416,11 @@ class Tracer:
 
         while active:
             fresh = t0 >= t1
+            if not quotient:
+                vertex, base, direction, t0 = self._approach(
+                    p, v, chords, mi.Float(1), vertex, base, direction, t0, reach, active & fresh)
+                t1 = mi.Float(t0)
             h = dr.maximum(chords.between(t0, reach - t0), 2**-21 * t0)
-            wanted = mi.Float(h)
-            empty = mi.Bool(False)
-            if far and not quotient:
-                skip = dr.minimum(self.outside(vertex, direction, bend), bend.longest)
-                empty = fresh & (skip > h)
-                h = dr.maximum(h, skip)
             last = h >= reach - t0
             h = dr.select(fresh, dr.minimum(h, reach - t0), 0)
             base, direction = geometry.short_flow(base, v, t1, h, k)
@@ -432,7 +428,7 @@ class Tracer:
             # Corners off the curve: secants would meet what is on its inner side, and only that.
             # Two chords whose ends stay on it are right on average with 4/3 of the sagitta. Near
             # the light they keep to the curve, not to reach behind it.
-            lift = dr.minimum((4 / 3) * 0.125 * dr.square(dr.select(empty, wanted, h)),
+            lift = dr.minimum((4 / 3) * 0.125 * dr.square(h),
                               0.2 * chords.room(reach - t1) / bend.across)
             corner = dr.fma(dr.select(last, 0, -lift), self.acceleration(base, direction), base)
             end = dr.select(fresh, corner, end)
@@ -441,7 +437,7 @@ class Tracer:
                 vertex, end, direction, t0)
             after = dr.select(leaves | ~last, space.slack, 0)
             ray = line_ray(o, d, time, dr.fma(s_last, speed, before + after) * space.size)
-            hit = scene.ray_test(ray, coherent=False, active=active & ~empty)
+            hit = scene.ray_test(ray, coherent=False, active=active & (t0 < reach))
 
             blocked |= hit
             t0 = dr.select(leaves, dr.fma(s_last, t1 - t0, t0), t1)

@@ -1,0 +1,99 @@
+"""How far a geodesic certainly stays outside of a box, however many turns of its helix that takes.
+
+Along a geodesic x and y are sinusoids of the angle u = k w t. b − k w x = 2 m and a + k w y = n are
+conserved, and so z' = w + k x b = (w² + b² − 2 m b)/w. It follows that |z''| = 2 |k a (b − m)|,
+that z falls (rises, if w < 0) only in the half of each turn in which b has the sign of m, by no
+more than `Passage.dip` in one turn, and that it gains the same height in every turn.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import geometry
+
+# Roundings of the conserved quantities, times ten: a helix that misses a box by less may meet it.
+MARGIN = 1e-5
+# A little less, or rounding takes the ray behind what lies on the box.
+SHORT = 0.999
+
+
+class Passage:
+    """What is the same all along the geodesic from ``p`` (cells) in frame direction ``v``."""
+
+    def __init__(self, p: mi.Point3f, v: mi.Vector3f, twist: mi.Float):
+        self.twist = twist
+        k, w = dr.maximum(dr.abs(twist), 1e-9), dr.abs(v.z)
+        c2 = dr.fma(v.x, v.x, v.y * v.y)
+        c = dr.sqrt(c2)
+        self.rate = twist * v.z
+        self.c = c
+        self.m2 = dr.fma(-self.rate, p.x, v.y)
+        self.n = dr.fma(self.rate, p.y, v.x)
+        self.upward = v.z > 0
+
+        # Bounds of |x''|, |y''| and of |z''|: |a b| ≤ c²/2 and |a| ≤ c
+        m2 = dr.abs(self.m2)
+        self.turn = dr.maximum(k * w * c, 1e-12)
+        self.rise = dr.maximum(k * dr.fma(c, m2, c2), 1e-12)
+
+        # The integral of (2 |m b| − b² − w²)/(k w²) over the half turn in which it may be positive:
+        # the first bound takes the largest integrand, the second leaves w² out
+        fall = dr.pi * dr.maximum(dr.fma(0.25 * m2, m2, -w * w), 0)
+        fall = dr.select(m2 > c, dr.minimum(fall, dr.fma(2 * m2, c, -0.5 * dr.pi * c2)), fall)
+        self.dip = fall * dr.rcp(dr.maximum(k * w * w, 1e-30))
+        self.period = 2 * dr.pi / dr.maximum(k * w, 1e-12)
+        self.gain = self.period * dr.fma(0.5 * c2, dr.rcp(dr.maximum(w, 1e-12)), w)
+
+
+class Box:
+    """An axis-aligned box from ``lower`` to ``upper`` (cells)."""
+
+    def __init__(self, lower: mi.Point3f, upper: mi.Point3f):
+        self.lower = lower
+        self.upper = upper
+
+    def excludes(self, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies outside."""
+        return dr.any((p < self.lower) | (p > self.upper))
+
+    def clearance(self, p: mi.Point3f, v: mi.Vector3f, passage: Passage) -> mi.Float:
+        """Arc length (cells) for which the geodesic at ``p`` in direction ``v`` stays outside.
+
+        0 inside; infinite if it never comes (back) to the box.
+        """
+        below, above = self.lower - p, p - self.upper
+        velocity = geometry.from_frame(p, v, passage.twist)
+        free = mi.Float(0)
+        for i, most in enumerate((passage.turn, passage.turn, passage.rise)):
+            # A coordinate that is off the box by g and moves away at speed u is not back as long as
+            # g + u t − M t²/2 > 0, where M bounds its acceleration.
+            gap = dr.maximum(below[i], above[i])
+            away = dr.select(above[i] > 0, velocity[i], -velocity[i])
+            root = dr.sqrt(dr.maximum(dr.fma(away, away, 2 * most * gap), 0))
+            back = dr.select(away > 0, (away + root) / most, 2 * gap / (root - away))
+            free = dr.maximum(free, dr.select(gap > 0, back, 0))
+
+        # In the mean z moves up (down, if w < 0): away from the box it comes back only by a dip,
+        # towards the box it takes so many turns.
+        gap = dr.maximum(below.z, above.z)
+        leaves = (above.z > 0) == passage.upward
+        turns = dr.floor(dr.maximum(gap - passage.dip, 0) / passage.gain)
+        free = dr.maximum(free, dr.select((gap > 0) & ~leaves, turns * passage.period, 0))
+        never = (gap > passage.dip) & (gap > 0) & leaves
+        never |= self._beside(passage)
+        return dr.select(never, dr.inf, SHORT * free)
+
+    def _beside(self, passage):
+        """Whether the circle over which the helix winds lies beside the box, times |k w|: the
+        radius is c, and the centre (−2 m, n)/(k w)."""
+        rate, c = passage.rate, passage.c
+        beside = mi.Bool(False)
+        for centre, low, high in ((-passage.m2, self.lower.x, self.upper.x),
+                                  (passage.n, self.lower.y, self.upper.y)):
+            low, high = rate * low, rate * high
+            low, high = dr.minimum(low, high), dr.maximum(low, high)
+            margin = MARGIN * (1 + dr.abs(centre) + dr.abs(low) + dr.abs(high))
+            beside |= (low - (centre + c) > margin) | ((centre - c) - high > margin)
+        return beside
