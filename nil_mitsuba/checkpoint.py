@@ -9,15 +9,12 @@ import struct
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from .files import replacing
-
-if TYPE_CHECKING:  # it needs a variant
-    from .passes import Sums
+from .sums import Sums, name_passes
 
 # The number is that of the format. JSON text follows, with its length before it, then the arrays
 # in the order in which it lists them, and the SHA-256 of all that.
@@ -70,7 +67,6 @@ class Checkpoint:
         The variant that it was made with has to be set: see ``peek``.
         """
         header, start = _header(data, name)
-        from .passes import Sums
 
         arrays = {}
         for key, shape in header["arrays"].items():
@@ -133,24 +129,6 @@ def describe(path: str | os.PathLike) -> str:
         f"  {key:{width}}  " + _word(value).replace("\n", "\n" + " " * (width + 4))
         for key, value in lines.items()
     )
-
-
-def joined(*ranges: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
-    """Sets of passes put together; raises ValueError if a pass is in two of them."""
-    together: list[tuple[int, int]] = []
-    for first, stop in sorted(part for several in ranges for part in several):
-        if together and first < together[-1][1]:
-            twice = first, min(stop, together[-1][1])
-            raise ValueError(f"the passes {name_passes([twice])} are there twice.")
-        if together and first == together[-1][1]:
-            first = together.pop()[0]
-        together.append((first, stop))
-    return tuple(together)
-
-
-def name_passes(ranges) -> str:
-    """Ranges of passes as they are written on a command line, such as "0:8, 12:16"."""
-    return ", ".join(f"{first}:{stop}" for first, stop in ranges)
 
 
 def _read(path) -> bytes:

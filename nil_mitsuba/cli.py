@@ -20,10 +20,11 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, checkpoint, exr, png, stills
-from .output import GUIDES, Output, metadata_of, software
+from . import __version__, checkpoint, exr, jobs, png, stills
+from .layers import GUIDES
+from .output import Output, metadata_of, software
 from .registration import refusal
-from .scene_files import Job, SceneFiles, fitted_cell
+from .sums import name_passes
 
 SUMS = ".sums"  # suffix of checkpoints and parts
 
@@ -175,70 +176,39 @@ def render(scene, define, properties, layers, fit, sensor, mode, threads, verbos
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     note = _silence if options["quiet"] else _note
-    job = None
-    if options["scheduler"] or options["workers"]:
+    clustered = bool(options["scheduler"] or options["workers"])
+    if clustered:
         if options["scheduler"] and options["workers"]:
             raise click.UsageError("--workers starts a cluster here, --scheduler names another.")
         from . import cluster  # noqa: F401 - says what it needs before anything is rendered
-
-        # Its properties, hash and samples per pass are known later
-        job = Job(str(scene_path.absolute()), mode, dict(define), {}, sensor, options["seed"],
-                  rules.spp, box_filter=options["denoise"])
     options |= {"worker_threads": threads, "layers": layers}
 
     _set_variant(mode, verbose)
     if options["denoise"]:
         _require_denoiser()
-    # Mitsuba 3.9 waits for ever for an EXR texture if there is no worker thread to read it.
     threads = threads or dr.thread_count()
-    dr.set_thread_count(max(threads, 2))
-    mi.set_file_resolver(_resolver(scene_path.parent))
+    dr.set_thread_count(threads)
     properties = dict(properties)
     if layers is not None:
         properties["aovs"] = layers
-    files = SceneFiles(str(scene_path), dict(define), properties)
-    if options["denoise"]:
-        files.use_box_filter()
-    for sentence in files.notes:
-        note(sentence)
-
-    # The integrator's parameters are checked before large meshes are loaded.
-    integrator = files.integrator()
-    scene_hash = files.hash
-    layers = getattr(integrator, "layers", ())
-    # Merged meshes have no numbers of their own
-    mi_scene = files.scene(merge="shape" not in layers)
-    further = {}
-    if fit:
-        further |= fitted_cell(mi_scene)
-        note("--fit: " + " ".join(f"{name}={value}" for name, value in further.items()))
-    if options["denoise"]:
-        further["aovs"] = ",".join({*layers, *GUIDES})
-    if further:
-        integrator = files.integrator(**further)
-    sensors = mi_scene.sensors()
-    if not sensors:
-        raise click.ClickException(f'the scene "{scene}" has no sensor.')
-    if sensor >= len(sensors):
-        raise click.ClickException(
-            f'the scene "{scene}" has no sensor {sensor}: its sensors are numbered from 0 to '
-            f"{len(sensors) - 1}."
-        )
+    sums_path = paths["sums"]
+    pass_spp = options["pass_spp"] or stills.pass_spp_of(sums_path, options["resume"])
+    job = jobs.Job(scene, mode, dict(define), properties, sensor, options["seed"], rules.spp,
+                   pass_spp, denoise=options["denoise"], fit=fit)
+    opened = jobs.open_scene(job, note)
     about = {
         "scene": scene,
-        "integrator": str(integrator),
+        "integrator": str(opened.integrator),
         "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
     }
-    dr.set_thread_count(threads)
-    if hasattr(integrator, "view"):
-        still = _still(mi_scene, integrator, sensor, scene_hash, rules, paths["sums"], note,
-                       options)
-        if job:
-            job = replace(job, properties=properties | further, pass_spp=still.passes.spp,
-                          scene_hash=scene_hash)
-        _render_still(still, about, layers, paths, options, job)
-    else:
-        _render_in_one_go(mi_scene, integrator, sensor, scene_hash, about, paths, options)
+    if not hasattr(opened.integrator, "view"):
+        _render_in_one_go(opened, about, paths, options)
+        return
+    if options["resume"] and not sums_path.exists():
+        note(f'there is no checkpoint "{sums_path}": beginning with the first pass.')
+    still = _still(opened, rules, options)
+    job = replace(opened.job, path=str(scene_path.absolute()), pass_spp=still.passes.spp)
+    _render_still(still, about, opened.layers, paths, options, job if clustered else None)
 
 
 @cli.command()
@@ -272,7 +242,7 @@ def merge(parts, output, **options):
         commands.append(further.about.get("commandLine"))
     missing = stills.missing(state)
     if missing:
-        _note(f"the passes {checkpoint.name_passes(missing)} of 0:{state.about['count']} are "
+        _note(f"the passes {name_passes(missing)} of 0:{state.about['count']} are "
               "missing.")
     # All that it took, line by line as in a script
     commands.append(shlex.join(["nil-mitsuba", *sys.argv[1:]]))
@@ -336,12 +306,9 @@ def tidy(text: str) -> str:
 # -------------------------------------------------------------------- rendering
 
 
-def _still(scene, integrator, sensor, scene_hash, rules, sums_path, note, options):
-    if options["resume"] and not sums_path.exists():
-        note(f'there is no checkpoint "{sums_path}": beginning with the first pass.')
-    still = stills.Still(scene, sensor, integrator, options["seed"], rules,
-                         options["pass_spp"] or stills.pass_spp_of(sums_path, options["resume"]),
-                         scene_hash)
+def _still(opened: jobs.Opened, rules: stills.Rules, options: dict) -> stills.Still:
+    """The still that is to be rendered, checked against what is to become of it."""
+    still = opened.still(rules)
     if options["denoise"]:
         _require_guides(still.settings)
     if options["png"] and not still.settings["film"]["pixel_format"]:
@@ -360,7 +327,7 @@ def _still(scene, integrator, sensor, scene_hash, rules, sums_path, note, option
 
 
 def _render_still(still: stills.Still, about: dict, layers, paths: dict, options: dict,
-                  job: Job | None) -> None:
+                  job: jobs.Job | None) -> None:
     """Render in passes, until all are done, a rule is met or a signal comes; write the files.
 
     A job goes to a cluster.
@@ -422,7 +389,7 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
         sums_path.unlink(missing_ok=True)
 
 
-def _render_in_one_go(scene, integrator, sensor, scene_hash, about, paths, options) -> None:
+def _render_in_one_go(opened: jobs.Opened, about: dict, paths: dict, options: dict) -> None:
     """Render with a wrapper of Mitsuba's around "nil", which knows no passes."""
     names = {"noise": "noise", "time": "seconds", "resume": "resume", "passes": "passes",
              "pass-spp": "pass_spp", "checkpoint": "checkpoint", "denoise": "denoise",
@@ -432,14 +399,15 @@ def _render_in_one_go(scene, integrator, sensor, scene_hash, about, paths, optio
         raise click.ClickException(
             f"--{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
         )
-    film = scene.sensors()[sensor].film()
+    job, scene = opened.job, opened.scene
+    film = scene.sensors()[job.sensor].film()
     start = time.perf_counter()
-    image = integrator.render(scene, sensor, seed=options["seed"], spp=options["spp"] or 0)
+    image = opened.integrator.render(scene, job.sensor, seed=job.seed, spp=job.spp or 0)
     dr.eval(image)
     dr.sync_thread()
-    spp = options["spp"] or scene.sensors()[sensor].sampler().sample_count()
+    spp = job.spp or scene.sensors()[job.sensor].sampler().sample_count()
     metadata = about | {
-        "sceneHash": scene_hash, "spp": spp, "seed": options["seed"], "sensor": sensor,
+        "sceneHash": job.scene_hash, "spp": spp, "seed": job.seed, "sensor": job.sensor,
         "renderTime": time.perf_counter() - start, "variant": mi.variant(),
         "software": software(stills.versions()),
     }
@@ -590,9 +558,3 @@ def _set_variant(variant: str, verbose: int) -> None:
         if sentence:
             raise click.ClickException(sentence)
     mi.set_variant(variant)
-
-
-def _resolver(folder: Path):
-    resolver = mi.FileResolver(mi.file_resolver())
-    resolver.prepend(str(folder))
-    return resolver

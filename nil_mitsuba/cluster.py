@@ -24,9 +24,10 @@ except ModuleNotFoundError:
         "pip install 'nil-mitsuba[cluster]'"
     ) from None
 
-from . import stills
-from .checkpoint import Checkpoint, name_passes
-from .scene_files import Job
+from . import jobs, stills
+from .checkpoint import Checkpoint
+from .jobs import Job
+from .sums import name_passes
 
 # A part is rendered while the next one waits: no worker is idle, and little is lost on stopping.
 PARTS_AHEAD = 2
@@ -242,7 +243,7 @@ class Hands:
 
 
 def render_part(job: Job, first: int, stop: int, threads: int | None) -> tuple[float, bytes]:
-    """Seconds that rendering took, and what `stills.render_part` returns; raises Refused."""
+    """Seconds that rendering took, and what `jobs.render_part` returns; raises Refused."""
     try:
         return _one_at_a_time.submit(_render_part, job, first, stop, threads).result()
     except (ValueError, RuntimeError, OSError) as error:
@@ -262,10 +263,9 @@ def dask_setup(_worker) -> None:
 
 
 def _render_part(job, first, stop, threads):
-    # Mitsuba 3.9 waits for ever for an EXR texture if there is no worker thread to read it
-    dr.set_thread_count(max(2, threads or dr.thread_count()))
+    dr.set_thread_count(threads or dr.thread_count())
     start = time.perf_counter()
-    data = stills.render_part(job, first, stop)
+    data = jobs.render_part(job, first, stop)
     return time.perf_counter() - start, data
 
 

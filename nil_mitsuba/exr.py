@@ -9,37 +9,13 @@ import re
 import struct
 import time
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from . import exr_header
 from .files import replacing
-
-
-class Layer(NamedTuple):
-    """Names of a layer's channels in the file, and the type that stores them."""
-
-    channels: tuple[str, ...]
-    storage: str | None  # None: as the picture is stored
-
-
-# A layer's name is what precedes the last dot. What follows it has one letter, since Blender
-# leaves channels with longer ones out; vectors have X, Y and Z in capitals, since Mitsuba cannot
-# split a file with others. Nuke's own layer of depths has the channel depth.Z. What is counted or
-# measured stays float32: whole numbers up to 2^24 are exact in it, signs and all, and programs
-# that know no integers read it.
-LAYERS: Mapping[str, Layer] = {
-    "distance": Layer(("depth.Z",), "float32"),
-    "position": Layer(("position.X", "position.Y", "position.Z"), "float32"),
-    "normal": Layer(("normal.X", "normal.Y", "normal.Z"), "float16"),
-    "albedo": Layer(("albedo.R", "albedo.G", "albedo.B"), "float16"),
-    "cell": Layer(("cell.X", "cell.Y", "cell.Z"), "float32"),
-    "shape": Layer(("shape.X",), "float32"),
-    "samples": Layer(("samples.X",), "float32"),
-    "noisy": Layer(("noisy.R", "noisy.G", "noisy.B"), None),
-}
+from .layers import LAYERS, Layer
 
 COMPONENT_FORMATS = ("float16", "float32", "uint32")
 
@@ -76,11 +52,6 @@ FIRST = (
 )  # fmt: skip
 
 
-def channel_names(layers: Iterable[str]) -> list[str]:
-    """Names in the file of the channels of `layers`, which are keys of ``LAYERS``."""
-    return [name for key in layers for name in LAYERS[key].channels]
-
-
 def component_format(film: mi.Film) -> str:
     """The type in which a film wants its pixels stored: one of ``COMPONENT_FORMATS``."""
     # A film tells it nowhere but in its description.
@@ -100,13 +71,13 @@ def write(
     """Write a picture and its layers as an OpenEXR file.
 
     `picture` holds the names of the channels and a tensor of shape (height, width, channels),
-    `layers` maps keys of ``LAYERS`` to tensors of the same height and width. `component_format`
-    (one of ``COMPONENT_FORMATS``) is the picture's; what a half cannot hold becomes ±65504.
-    `metadata` become attributes of the header: text, numbers without loss (whole numbers beyond
-    32 bits as text), truth values as "true" and "false", and everything else as JSON. The
-    standard attributes ``capDate`` and ``utcOffset`` are added. The file has one part; with a
-    lossy `compression`, layers that are not colours are in a second one, compressed by "zip". The
-    OpenEXR package, and NumPy with it, is imported here and not before.
+    `layers` maps keys of ``layers.LAYERS`` to tensors of the same height and width.
+    `component_format` (one of ``COMPONENT_FORMATS``) is the picture's; what a half cannot hold
+    becomes ±65504. `metadata` become attributes of the header: text, numbers without loss (whole
+    numbers beyond 32 bits as text), truth values as "true" and "false", and everything else as
+    JSON. The standard attributes ``capDate`` and ``utcOffset`` are added. The file has one part;
+    with a lossy `compression`, layers that are not colours are in a second one, compressed by
+    "zip". The OpenEXR package, and NumPy with it, is imported here and not before.
 
     Raises ValueError for what does not fit together and OSError if the file cannot be written; a
     file that `path` named before is then as it was.
@@ -114,7 +85,7 @@ def write(
     _one_of(COMPRESSIONS, compression, "compression")
     _one_of(COMPONENT_FORMATS, component_format, "component format")
     names, image = picture
-    images = {"picture": (Layer(tuple(names), None), image)}
+    images = {"picture": (Layer(tuple(names), None, None), image)}
     for key, tensor in (layers or {}).items():
         images[key] = LAYERS[_one_of(LAYERS, key, "layer")], tensor
     _check(images)

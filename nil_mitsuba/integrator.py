@@ -11,8 +11,9 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
+from .layers import LAYERS, RENDERED, channel_names
 from .lights import Lights, lobe_angle
-from .passes import COUNT_LAYERS, LAYERS, MEAN_LAYERS, Passes, layer_channels
+from .passes import Passes
 from .quotient import Space, multiply_cells, shape_box
 from .tracer import Cone, Tracer
 
@@ -105,7 +106,7 @@ class NilIntegrator(ADIntegrator):
 
     def aov_names(self) -> list[str]:
         """Names of the channels that the layers add to the picture's."""
-        return layer_channels(self.layers)
+        return channel_names(self.layers)
 
     def sample(self, mode, scene, sampler, ray, active=True, **_):
         """One sample per ray, for integrators that wrap this one (``moment``, ``aov``).
@@ -342,15 +343,17 @@ class View:
         self.tracer = Tracer(scene, self.space, integrator.max_distance)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
-        self.layers = [layer for layer in integrator.layers if layer not in COUNT_LAYERS]
+        self.layers = [layer for layer in integrator.layers if LAYERS[layer].rule != "count"]
         if "shape" in self.layers:
             self._number_shapes()
 
     def nothing_seen(self) -> dict[str, list]:
         """The channels of each layer where a path meets nothing."""
-        return {layer: [mi.Float(0) if layer in MEAN_LAYERS else mi.Int32(-(layer == "shape"))
-                        for _ in LAYERS[layer]]
-                for layer in self.layers}
+        def nothing(layer):
+            mean = LAYERS[layer].rule == "mean"
+            return mi.Float(0) if mean else mi.Int32(-(layer == "shape"))
+
+        return {layer: [nothing(layer) for _ in LAYERS[layer].channels] for layer in self.layers}
 
     @dr.syntax
     def see(self, seen, hit, si, home, spent, first):
@@ -445,13 +448,13 @@ def _point(props, name):
 
 
 def _layers(props):
-    """The chosen layers in the order of `LAYERS`, each once."""
+    """The chosen layers in the order of `RENDERED`, each once."""
     text = props.get("aovs", "")
     if not isinstance(text, str):
         raise RuntimeError('The property "aovs" has the wrong type (expected <string>).')
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
-        if name not in LAYERS:
+        if name not in RENDERED:
             raise RuntimeError(f'"aovs" names the layer "{name}", which is none of '
-                               f"{', '.join(LAYERS)}")
-    return tuple(layer for layer in LAYERS if layer in names)
+                               f"{', '.join(RENDERED)}")
+    return tuple(layer for layer in RENDERED if layer in names)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import exr, png
-from .checkpoint import Checkpoint, name_passes
+from .checkpoint import Checkpoint
+from .layers import GUIDES
 from .stills import Picture
-
-# Layers that guide the denoiser.
-GUIDES = ("albedo", "normal")
+from .sums import name_passes
 
 
 @dataclass(frozen=True)

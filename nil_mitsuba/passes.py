@@ -7,70 +7,19 @@ machine, and their sums added up. Layers come from the first vertices of the sam
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from .camera import Camera
-from .checkpoint import joined
-from .exr import LAYERS as FILE_LAYERS
+from .layers import LAYERS, channel_names
+from .sums import Sums, develop, luminance
 
 # Camera samples in one wavefront: more use no processor better, and memory grows with them.
 WAVEFRONT_SAMPLES = 2**21
 
-# Layers that are averaged over a pixel as the picture is, with their channels, ...
-MEAN_LAYERS = {layer: FILE_LAYERS[layer].channels
-               for layer in ("distance", "position", "normal", "albedo")}
-# ... layers of whole numbers, which no average could name: those of a pixel's first sample, ...
-POINT_LAYERS = {layer: FILE_LAYERS[layer].channels for layer in ("cell", "shape")}
-# ... and the number of samples in a pixel.
-COUNT_LAYERS = {"samples": FILE_LAYERS["samples"].channels}
-LAYERS = MEAN_LAYERS | POINT_LAYERS | COUNT_LAYERS
-
 NO_PIXEL = 2**32 - 1  # number of a pixel outside of the crop
-
-LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB, as Mitsuba weighs it
-
-
-@dataclass
-class Sums:
-    """What passes add up to, in double precision: 2³² samples and more lose nothing.
-
-    ``values``: TensorXd, height × width × channels of the film, weights included; ``moments``:
-    TensorXd, 3 × height × width, sums over passes of S², S·W and W², where S is the sum of weighted
-    luminances in a pixel of one pass and W that of the weights; ``points``: TensorXi, height ×
-    width × channels of the point layers; ``passes``: ranges (first, stop) of the passes that are
-    in, sorted.
-    """
-
-    values: mi.TensorXd
-    moments: mi.TensorXd
-    points: mi.TensorXi
-    passes: tuple[tuple[int, int], ...]
-
-    @property
-    def count(self) -> int:
-        """Number of passes that are in."""
-        return sum(stop - first for first, stop in self.passes)
-
-    def plus(self, other: Sums) -> Sums:
-        """The sums of both; point layers are those of the lowest pass.
-
-        Raises ValueError if a pass is in both.
-        """
-        passes = joined(self.passes, other.passes)
-        first = min((sums for sums in (self, other) if sums.passes), default=self,
-                    key=lambda sums: sums.passes[0])
-        sums = Sums(self.values + other.values, self.moments + other.moments, first.points, passes)
-        dr.eval(sums.values, sums.moments)
-        return sums
-
-
-def layer_channels(layers, of: dict[str, tuple[str, ...]] = LAYERS) -> list[str]:
-    """Names of the channels of those of ``layers`` that are in `of`, in its order."""
-    return [name for layer, names in of.items() if layer in layers for name in names]
 
 
 class Passes:
@@ -109,12 +58,12 @@ class Passes:
 
         self.view = integrator.view(scene)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
-        self.film.prepare(layer_channels(self.layers, MEAN_LAYERS))
+        self.film.prepare(channel_names(self.layers, "mean"))
 
     def nothing(self) -> Sums:
         """The sums of no passes."""
         crop = self.film.crop_size()
-        depth = len(layer_channels(self.layers, POINT_LAYERS))
+        depth = len(channel_names(self.layers, "first"))
         values = dr.zeros(mi.TensorXd, (crop.y, crop.x, self.film.create_block().channel_count()))
         moments = dr.zeros(mi.TensorXd, (3, crop.y, crop.x))
         # In memory, so that the first pass is added by the same kernel as all others
@@ -128,7 +77,7 @@ class Passes:
             # As Mitsuba does: samples of one pixel are summed up before they reach the film
             block.set_coalesce(block.coalesce() and self.spp >= 4)
             crop = self.film.crop_size()
-            depth = len(layer_channels(self.layers, POINT_LAYERS))
+            depth = len(channel_names(self.layers, "first"))
             points = dr.zeros(mi.Int32, crop.y * crop.x * depth)
             for band in range(self.bands):
                 self._render_band(block, points, index * self.bands + band, band * self.band)
@@ -163,9 +112,9 @@ class Passes:
             value=dr.select(inside, radiance * weight, 0),
             weight=dr.select(inside, mi.Float(1), 0),
             alpha=dr.select(valid & inside, mi.Float(1), 0),
-            aovs=self._channels(seen, MEAN_LAYERS), wavelengths=ray.wavelengths,
+            aovs=self._channels(seen, "mean"), wavelengths=ray.wavelengths,
         )
-        channels = self._channels(seen, POINT_LAYERS)
+        channels = self._channels(seen, "first")
         del sampler, ray, weight, position, across, start, radiance, valid, seen, inside
         # Together: what is evaluated later would be traced again
         dr.eval(block.tensor(), [number, *channels] if channels else [])
@@ -211,38 +160,9 @@ class Passes:
             position = mi.Vector2f(place)
         return number, inside, ray, weight, position, on_film.x
 
-    def _channels(self, seen, of):
-        return [channel for layer in of if layer in self.layers for channel in seen[layer]]
-
-
-def develop(film: mi.Film, layers: tuple[str, ...], sums: Sums, pass_spp: int) -> mi.TensorXf:
-    """The image in ``film`` of passes of ``pass_spp`` samples that rendered ``layers``, too."""
-    film.prepare(layer_channels(layers, MEAN_LAYERS))
-    film.put_block(mi.ImageBlock(mi.TensorXf(sums.values), film.crop_offset()))
-    image = film.develop()
-    shape = image.shape[:2]
-    further = [mi.TensorXf(sums.points)] if sums.points.shape[2] else []
-    if "samples" in layers:
-        further.append(dr.full(mi.TensorXf, sums.count * pass_spp, (*shape, 1)))
-    return dr.concat([image, *further], axis=2) if further else image
-
-
-def luminance(film: mi.Film, values: mi.TensorXf | mi.TensorXd) -> tuple[mi.Float64, mi.Float64]:
-    """Sums of luminances and of weights by pixel, out of the channels that a film sums up."""
-    channels = values.shape[2]
-    pixel = dr.arange(mi.UInt32, values.shape[0] * values.shape[1]) * channels
-
-    def channel(i):
-        return mi.Float64(dr.gather(type(values.array), values.array, pixel + i))
-
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        # Bands of its own, none more important than another; the last channel is the weight
-        weight = channels - 1
-        colours: tuple[float, ...] = (1 / weight,) * weight
-    else:
-        weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
-        colours = LUMINANCE
-    return sum(c * channel(i) for i, c in enumerate(colours)), channel(weight)
+    def _channels(self, seen, rule):
+        return [channel for layer in self.layers if LAYERS[layer].rule == rule
+                for channel in seen[layer]]
 
 
 def pass_seed(seed: int, index: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -191,25 +190,3 @@ def fitted_cell(scene) -> dict[str, str]:
     origin = bbox.center() - size / 2
     # 9 digits give a float32 back
     return {"cell_origin": ",".join(f"{c:.9g}" for c in origin), "cell_size": f"{size:.9g}"}
-
-
-@dataclass(frozen=True)
-class Job:
-    """What to render, in plain values that can be sent to another process.
-
-    ``path`` is that of the scene file, where the process finds it; ``properties`` are those of
-    "nil", the layers among them ("aovs"). ``spp`` and ``pass_spp`` (samples per pixel, of the image
-    and of a pass) may be None, for the scene's and for as many as fit; ``scene_hash`` too, for
-    whatever lies there. ``box_filter`` replaces the film's filter, as denoising needs it.
-    """
-
-    path: str
-    variant: str = "llvm_ad_rgb"
-    defines: dict[str, str] = field(default_factory=dict)
-    properties: dict[str, str] = field(default_factory=dict)
-    sensor: int = 0
-    seed: int = 0
-    spp: int | None = None
-    pass_spp: int | None = None
-    scene_hash: str | None = None
-    box_filter: bool = False

@@ -20,7 +20,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -28,10 +27,8 @@ import mitsuba as mi
 from . import __version__, checkpoint
 from .checkpoint import Checkpoint
 from .exr import component_format
-from .scene_files import Job, SceneFiles
-
-if TYPE_CHECKING:  # it needs a variant
-    from .passes import Sums
+from .layers import LAYERS, channel_names
+from .sums import Sums, develop, luminance
 
 # A checkpoint is never older than this, as long as no single pass and no writing takes longer.
 CHECKPOINT_SECONDS = 60.0
@@ -335,8 +332,6 @@ def noise(film: mi.Film, sums: Sums) -> float | None:
     A pixel's luminance is the ratio R = ΣS/ΣW of sums over n passes; the variance of such a ratio
     is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13).
     """
-    from .passes import luminance
-
     total, weight = luminance(film, sums.values)
     pixels = len(weight)
     ss, sw, ww = (dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels)
@@ -399,58 +394,6 @@ def pass_spp_of(path: str | os.PathLike | None, resume: bool) -> int | None:
     return checkpoint.peek(path)["pass_spp"]
 
 
-# ------------------------------------------------------------------------ parts
-
-
-def open_job(job: Job) -> Still:
-    """The still that a job describes, with its scene loaded; sets the job's variant.
-
-    Raises ValueError, RuntimeError or OSError with a sentence if it cannot be rendered, or if the
-    scene is not the one with the job's hash.
-    """
-    mi.set_variant(job.variant)
-    resolver = mi.FileResolver(mi.file_resolver())
-    resolver.prepend(os.path.dirname(job.path) or ".")
-    mi.set_file_resolver(resolver)
-    files = SceneFiles(job.path, job.defines, job.properties)
-    if job.box_filter:
-        files.use_box_filter()
-    scene_hash = files.hash
-    if job.scene_hash not in (None, scene_hash):
-        raise ValueError(f'"{job.path}" or a file that it names differs from the one expected.')
-    integrator = files.integrator()
-    scene = files.scene(merge="shape" not in integrator.layers)
-    return Still(scene, job.sensor, integrator, job.seed, Rules(spp=job.spp), job.pass_spp,
-                 scene_hash)
-
-
-def render_part(job: Job, first: int, stop: int) -> bytes:
-    """Passes ``first`` to ``stop`` − 1 of a job, as the contents of a checkpoint file.
-
-    The scene of the last job stays loaded in this process.
-    """
-    if _opened.get("job") != job:
-        _opened.clear()
-        _opened.update(still=open_job(job), job=job)
-    still = _opened["still"]
-    state = still.nothing()
-    for index in range(first, stop):
-        state = state.plus(still.render(index))
-    return state.to_bytes()
-
-
-_opened: dict = {}
-
-
-def merge(states: Iterable[Checkpoint]) -> Checkpoint:
-    """Parts of one still put together; raises ValueError if they are not, or overlap."""
-    states = iter(states)
-    together = next(states)
-    for state in states:
-        together = together.plus(state)
-    return together
-
-
 def missing(state: Checkpoint) -> list[tuple[int, int]]:
     """Ranges of passes that are not in a still whose ``about`` says how many there should be."""
     gaps, index = [], 0
@@ -477,8 +420,6 @@ class Picture:
 
 def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
     """The picture and the layers of a still, developed by ``film`` or by one like its own."""
-    from .passes import LAYERS, develop
-
     settings = state.settings
     if film is None:
         film = film_of(settings["film"])
@@ -486,12 +427,13 @@ def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
     layers = settings["layers"]
     names = list(settings["film"]["pixel_format"].upper())
     if not names:  # a film with channels of its own
-        total = sum(len(LAYERS[layer]) for layer in layers)
+        total = len(channel_names(layers))
         names = [field.name for field in film.bitmap().struct_()][:image.shape[2] - total]
     planes, at = {}, len(names)
     for layer in layers:
-        planes[layer] = image[:, :, at:at + len(LAYERS[layer])]
-        at += len(LAYERS[layer])
+        end = at + len(LAYERS[layer].channels)
+        planes[layer] = image[:, :, at:end]
+        at = end
     return Picture(names, image[:, :, :len(names)], planes, settings["film"]["component_format"])
 
 

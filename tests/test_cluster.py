@@ -8,8 +8,8 @@ from dataclasses import replace
 import drjit as dr
 import pytest
 
-from nil_mitsuba import checkpoint, cli, stills
-from nil_mitsuba.scene_files import Job
+from nil_mitsuba import checkpoint, cli, jobs, stills
+from nil_mitsuba.jobs import Job
 
 distributed = pytest.importorskip("distributed")
 
@@ -33,7 +33,7 @@ def hands(client, monkeypatch):
     """Hands that give out ten parts of one pass each; their contents are the passes' numbers."""
     monkeypatch.setattr(cluster, "PART_SECONDS", 1e-9)
     monkeypatch.setattr(cluster, "LOOK_SECONDS", 0.1)
-    monkeypatch.setattr(stills, "render_part", passes)
+    monkeypatch.setattr(jobs, "render_part", passes)
     complaints = []
     hands = cluster.Hands(client, JOB, cluster.Queue(range(10), 10), None, complaints.append)
     hands.complaints = complaints
@@ -99,7 +99,7 @@ def test_few_parts_are_on_their_way(hands, monkeypatch):
 
 def test_a_part_without_passes_comes_while_others_take_long(hands, monkeypatch):
     ready = threading.Event()
-    monkeypatch.setattr(stills, "render_part", lambda *args: ready.wait(20) and passes(*args))
+    monkeypatch.setattr(jobs, "render_part", lambda *args: ready.wait(20) and passes(*args))
     parts = hands.parts()
     assert next(parts) is None
     ready.set()
@@ -107,7 +107,7 @@ def test_a_part_without_passes_comes_while_others_take_long(hands, monkeypatch):
 
 
 def test_a_part_without_passes_changes_nothing(job):
-    still = stills.open_job(job)
+    still = jobs.open_still(job)
     state = still.render(0)
     for sums in (state.plus(still.nothing()).sums, still.nothing().plus(state).sums):
         assert sums.passes == ((0, 1),)
@@ -172,7 +172,7 @@ def test_passes_that_end_every_worker_end_in_a_sentence(hands, monkeypatch):
     def render_part(*_):
         raise distributed.KilledWorker("task", Worker, 3)
 
-    monkeypatch.setattr(stills, "render_part", render_part)
+    monkeypatch.setattr(jobs, "render_part", render_part)
     with pytest.raises(OSError, match=r"took the passes \d:\d+ ended, the last .*10.0.0.7:1234"):
         came(hands)
 
@@ -202,7 +202,7 @@ def test_passes_of_workers_that_are_gone_go_to_others(hands, monkeypatch):
 
 
 def test_parts_that_came_before_an_error_are_saved(job, tmp_path):
-    still = stills.open_job(job)
+    still = jobs.open_still(job)
 
     def parts():
         yield still.render(0)
@@ -264,13 +264,13 @@ def job(tmp_path, rgb):
     (tmp_path / "triangle.obj").write_text(TRIANGLE)
     job = Job(str(tmp_path / "scene.xml"), defines={"resolution": "32"}, spp=24 * 64,
               pass_spp=64, properties={"aovs": "distance,cell"})
-    return replace(job, scene_hash=stills.open_job(job).settings["scene"])
+    return replace(job, scene_hash=jobs.open_still(job).settings["scene"])
 
 
 @pytest.mark.verify
 def test_a_killed_worker_changes_nothing_in_the_picture(job, monkeypatch):
     monkeypatch.setattr(cluster, "PART_SECONDS", 1e-9)
-    still = stills.open_job(job)
+    still = jobs.open_still(job)
     alone, number = still.accumulate(still.nothing(), map(still.render, range(24)))
     assert number is None
 
@@ -296,7 +296,7 @@ def test_a_killed_worker_changes_nothing_in_the_picture(job, monkeypatch):
 
 @pytest.mark.verify
 def test_an_interrupted_cluster_leaves_a_checkpoint_that_one_process_goes_on_with(job):
-    still = stills.open_job(job)
+    still = jobs.open_still(job)
 
     def parts():
         interrupted = False

@@ -4,9 +4,10 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from nil_mitsuba import exr, geometry
+from nil_mitsuba import geometry
+from nil_mitsuba import layers as table
 
-LAYERS = {name: layer.channels for name, layer in exr.LAYERS.items() if name != "noisy"}
+LAYERS = {name: table.LAYERS[name].channels for name in table.RENDERED}
 
 ORIGIN, SIZE = (0.1, 0.15, 0.2), 1.5  # of the cell: neither is the default
 CAMERA = (0.3, 0.4, 0.5)

@@ -17,6 +17,7 @@ import mitsuba as mi
 import pytest
 
 from nil_mitsuba import denoise, exr, exr_header, files, png
+from nil_mitsuba.layers import LAYERS, channel_names
 
 HEIGHT, WIDTH = 37, 53  # nothing divides them
 
@@ -52,7 +53,7 @@ def smooth_image(channels):
 
 def all_layers():
     images = {key: random_image(len(layer.channels), seed)
-              for seed, (key, layer) in enumerate(exr.LAYERS.items())}
+              for seed, (key, layer) in enumerate(LAYERS.items())}
     return images | {
         "position": 100 * images["position"] - 50,
         "normal": 2 * images["normal"] - 1,
@@ -96,12 +97,12 @@ def test_layers_keep_their_values_whatever_the_compression(
     )  # fmt: skip
     types, channels = read_channels(tmp_path / "a.exr")
 
-    assert set(channels) == {*"RGBA", *exr.channel_names(exr.LAYERS)}
+    assert set(channels) == {*"RGBA", *channel_names(LAYERS)}
     for i, name in enumerate("RGBA"):
         assert types[name] == component_format
         error = dr.max(dr.abs(channels[name] - picture[:, :, i]).array)
         assert error < (0.02 if compression in exr.LOSSY else 1e-3)
-    for key, layer in exr.LAYERS.items():
+    for key, layer in LAYERS.items():
         for i, name in enumerate(layer.channels):
             assert types[name] == (layer.storage or component_format)
             written = layers[key][:, :, i]
@@ -123,11 +124,11 @@ def test_mitsuba_splits_a_file_into_the_picture_and_its_layers(tmp_path):
     exr.write(tmp_path / "a.exr", ("RGBA", picture), layers, component_format="float32")
     bitmaps = dict(mi.Bitmap(str(tmp_path / "a.exr")).split())
 
-    names = {"distance": "depth"} | {key: key for key in exr.LAYERS if key != "distance"}
+    names = {"distance": "depth"} | {key: key for key in LAYERS if key != "distance"}
     assert set(bitmaps) == {"<root>", *names.values()}
     assert equal(mi.TensorXf(bitmaps["<root>"]), picture)
     for key, name in names.items():
-        stored = exr.LAYERS[key].storage == "float16"
+        stored = LAYERS[key].storage == "float16"
         expected = as_half(layers[key]) if stored else layers[key]
         assert equal(mi.TensorXf(bitmaps[name]), expected), key
 
@@ -156,7 +157,7 @@ def test_openimageio_reads_layers_and_metadata(tmp_path, compression):
     assert done.returncode == 0, done.stderr
     lists = re.findall("channel list: (.*)", done.stdout)
     listed = [name.partition(" ")[0] for line in lists for name in line.split(", ")]
-    assert sorted(listed) == sorted([*"RGBA", *exr.channel_names(exr.LAYERS)])
+    assert sorted(listed) == sorted([*"RGBA", *channel_names(LAYERS)])
     for name in ("cell.Y (float)", "normal.Y (half)", "spp: 64", "tolerance: 0.25"):
         assert name in done.stdout
 

@@ -9,14 +9,16 @@ import subprocess
 import sys
 import threading
 import time
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
 import nil_mitsuba
-from nil_mitsuba import checkpoint, stills
-from nil_mitsuba.scene_files import Job, SceneFiles
+from nil_mitsuba import checkpoint, jobs, stills
+from nil_mitsuba.jobs import Job
+from nil_mitsuba.scene_files import SceneFiles
 
 HERE = pathlib.Path(__file__).parent
 
@@ -244,7 +246,7 @@ def test_noise_is_the_error_that_there_is(rgb, rfilter):
 
 def luminances(scene, spp, pass_spp, seed):
     """Luminance of each pixel, and the estimated noise."""
-    from nil_mitsuba.passes import luminance
+    from nil_mitsuba.sums import luminance
 
     still = still_of(scene, spp, pass_spp, seed)
     state = sums_of(still, *range(still.count))
@@ -609,11 +611,11 @@ def test_full_hd_stays_below_4_gibibytes(folder):
 
 def test_parts_of_processes_of_their_own_merge_to_the_whole(folder):
     job = Job(str(folder / "scene.xml"), spp=64, pass_spp=16, seed=7)
-    still = stills.open_job(job)
+    still = jobs.open_still(job)
     job = Job(job.path, spp=64, pass_spp=16, seed=7, scene_hash=still.settings["scene"])
-    parts = [stills.render_part(job, first, stop) for first, stop in ((2, 4), (0, 1), (1, 2))]
+    parts = [jobs.render_part(job, first, stop) for first, stop in ((2, 4), (0, 1), (1, 2))]
     states = [checkpoint.Checkpoint.from_bytes(part) for part in parts]
-    merged = stills.merge(states)
+    merged = reduce(checkpoint.Checkpoint.plus, states)
     assert merged.sums.passes == ((0, 4),)
     merged.require(still.settings)
     assert dr.allclose(still.develop(merged), still.develop(sums_of(still, 0, 1, 2, 3)), rtol=1e-6)
@@ -621,11 +623,11 @@ def test_parts_of_processes_of_their_own_merge_to_the_whole(folder):
     assert equal(stills.picture_of(merged).image, still.develop(merged))
 
     with pytest.raises(ValueError, match="passes 0:1 are there twice"):
-        stills.merge([*states, states[1]])
+        merged.plus(states[1])
     (folder / "triangle.obj").write_text(TRIANGLE.replace(".9", ".8"))
-    stills._opened.clear()
+    jobs._opened.clear()
     with pytest.raises(ValueError, match="differs"):
-        stills.render_part(job, 0, 1)
+        jobs.render_part(job, 0, 1)
 
 
 @pytest.mark.parametrize(

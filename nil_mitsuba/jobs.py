@@ -1,0 +1,152 @@
+"""Jobs, which say what to render in plain values, and the one way in which all processes open them.
+
+The command, its workers and those of a cluster open the same job: they cannot disagree on a scene.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from .layers import GUIDES
+from .scene_files import SceneFiles, fitted_cell
+from .stills import Rules, Still
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to render, in plain values that can be sent to another process.
+
+    ``path`` is that of the scene file, where the process finds it; ``properties`` are those of
+    "nil", the layers among them ("aovs"). ``spp`` and ``pass_spp`` (samples per pixel, of the image
+    and of a pass) may be None, for the scene's and for as many as fit; ``scene_hash`` too, for
+    whatever lies there. ``denoise`` asks for what denoising needs: a film with the filter "box" and
+    the layers that guide it. ``fit`` fits the cell to the scene's bounding box.
+    """
+
+    path: str
+    variant: str = "llvm_ad_rgb"
+    defines: dict[str, str] = field(default_factory=dict)
+    properties: dict[str, str] = field(default_factory=dict)
+    sensor: int = 0
+    seed: int = 0
+    spp: int | None = None
+    pass_spp: int | None = None
+    scene_hash: str | None = None
+    denoise: bool = False
+    fit: bool = False
+
+
+class Opened(NamedTuple):
+    """A job's scene and integrator, loaded.
+
+    ``job`` is the job with all that loading has found out: it opens to the same scene, or not at
+    all. ``layers`` are those that were asked for, which denoising may have added to.
+    """
+
+    job: Job
+    scene: mi.Scene
+    integrator: mi.Integrator
+    layers: tuple[str, ...]
+
+    def still(self, rules: Rules) -> Still:
+        """What is to be rendered; raises ValueError if the integrator is not "nil" itself."""
+        job = self.job
+        return Still(self.scene, job.sensor, self.integrator, job.seed, rules, job.pass_spp,
+                     job.scene_hash)
+
+
+def open_scene(job: Job, note: Callable[[str], None] = lambda _: None) -> Opened:
+    """Load a job's scene; sets the job's variant.
+
+    ``note`` is told, in sentences, what differs from the scene file. Raises ValueError,
+    RuntimeError or OSError with a sentence if the scene cannot be loaded, or if it is not the one
+    with the job's hash.
+    """
+    mi.set_variant(job.variant)
+    with _beside(job.path), _enough_threads():
+        files = SceneFiles(job.path, job.defines, job.properties)
+        if job.denoise:
+            files.use_box_filter()
+        for sentence in files.notes:
+            note(sentence)
+
+        # The integrator's parameters are checked before large meshes are loaded
+        integrator = files.integrator()
+        scene_hash = files.hash
+        if job.scene_hash not in (None, scene_hash):
+            raise ValueError(f'"{job.path}" or a file that it names differs from the one expected.')
+        layers = getattr(integrator, "layers", ())
+        # Merged meshes have no numbers of their own
+        scene = files.scene(merge="shape" not in layers)
+        further: dict[str, str] = {}
+        if job.fit:
+            further |= fitted_cell(scene)
+            note("--fit: " + " ".join(f"{name}={value}" for name, value in further.items()))
+        if job.denoise:
+            further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
+        if further:
+            integrator = files.integrator(**further)
+    sensors = len(scene.sensors())
+    if not sensors:
+        raise ValueError(f'the scene "{job.path}" has no sensor.')
+    if job.sensor >= sensors:
+        raise ValueError(
+            f'the scene "{job.path}" has no sensor {job.sensor}: its sensors are numbered from 0 '
+            f"to {sensors - 1}."
+        )
+    job = replace(job, properties=job.properties | further, scene_hash=scene_hash, fit=False)
+    return Opened(job, scene, integrator, layers)
+
+
+def open_still(job: Job) -> Still:
+    """The still that a job describes; raises what ``open_scene`` does."""
+    return open_scene(job).still(Rules(spp=job.spp))
+
+
+def render_part(job: Job, first: int, stop: int) -> bytes:
+    """Passes ``first`` to ``stop`` − 1 of a job, as the contents of a checkpoint file.
+
+    The scene of the last job stays loaded in this process.
+    """
+    if _opened.get("job") != job:
+        _opened.clear()
+        _opened.update(still=open_still(job), job=job)
+    still = _opened["still"]
+    state = still.nothing()
+    for index in range(first, stop):
+        state = state.plus(still.render(index))
+    return state.to_bytes()
+
+
+_opened: dict = {}
+
+
+@contextlib.contextmanager
+def _beside(path: str) -> Iterator[None]:
+    """Names of files mean those in the folder of the scene first, and in no earlier scene's."""
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    resolver.prepend(os.path.dirname(path) or ".")
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
+
+
+@contextlib.contextmanager
+def _enough_threads() -> Iterator[None]:
+    """Mitsuba 3.9 waits for ever for an EXR texture if there is no worker thread to read it."""
+    before = dr.thread_count()
+    dr.set_thread_count(max(before, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)

@@ -1,0 +1,97 @@
+"""Jobs: every process that opens one gets the same scene, or a sentence."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from nil_mitsuba import jobs, stills
+from nil_mitsuba.layers import LAYERS, RENDERED
+
+SCENE = """
+<scene version="3.0.0">
+    <integrator type="nil"/>
+    <sensor type="perspective">
+        <transform name="to_world">
+            <lookat origin="0.1, 0.1, 0.6" target="0.7, 1, 0.4" up="0, 0, 1"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="8"/><integer name="height" value="8"/>
+        </film>
+    </sensor>
+    <emitter type="constant"/>
+    <shape type="obj"><string name="filename" value="triangle.obj"/></shape>
+</scene>
+"""
+TRIANGLE = "v 0.1 0.1 .9\nv 0.9 0.1 .9\nv 0.1 0.9 .9\nf 1 3 2\n"
+
+
+@pytest.fixture
+def job(tmp_path, rgb):
+    """A job whose cell is fitted and whose picture is to be denoised."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "triangle.obj").write_text(TRIANGLE)
+    return jobs.Job(str(tmp_path / "scene.xml"), spp=8, pass_spp=4, seed=3, fit=True, denoise=True,
+                    properties={"aovs": "distance", "twist": "2"})
+
+
+def test_what_a_job_opens_to_is_what_its_workers_open(job):
+    opened = jobs.open_scene(job)
+    here = opened.still(stills.Rules(spp=8))
+    assert not opened.job.fit and opened.job.scene_hash
+    assert jobs.open_still(opened.job).settings == here.settings
+    assert here.settings["integrator"]["cell_size"] == pytest.approx(0.8 * (1 + 1e-3), rel=1e-6)
+    assert here.settings["layers"] == ["distance", "normal", "albedo"]
+    assert here.settings["film"]["filter"].startswith("BoxFilter")
+    assert opened.layers == ("distance",)
+
+
+def test_a_scene_that_has_changed_is_not_opened(job, tmp_path):
+    opened = jobs.open_scene(job)
+    (tmp_path / "triangle.obj").write_text(TRIANGLE.replace(".9", ".8"))
+    with pytest.raises(ValueError, match="differs from the one expected"):
+        jobs.open_scene(opened.job)
+
+
+def test_a_scene_without_its_files_does_not_find_those_of_an_earlier_one(job, tmp_path):
+    jobs.open_scene(job)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "scene.xml").write_text(SCENE)
+    with pytest.raises(RuntimeError, match="triangle.obj"):
+        jobs.open_scene(replace(job, path=str(other / "scene.xml")))
+
+
+def test_opening_leaves_threads_and_folders_as_they_were(job):
+    resolver, threads = mi.file_resolver(), dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        jobs.open_scene(job)
+        assert dr.thread_count() == 1
+    finally:
+        dr.set_thread_count(threads)
+    assert list(map(str, mi.file_resolver())) == list(map(str, resolver))
+
+
+def test_a_sensor_that_is_not_there_is_refused(job):
+    with pytest.raises(ValueError, match=r"no sensor 2: its sensors are numbered from 0 to 0"):
+        jobs.open_scene(replace(job, sensor=2))
+
+
+def test_an_image_holds_layers_in_the_order_of_their_rules():
+    rules = [LAYERS[layer].rule for layer in RENDERED]
+    assert rules == sorted(rules, key=["mean", "first", "count"].index)
+
+
+def test_rendering_needs_no_file_format():
+    code = (
+        "import nil_mitsuba, sys, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"
+        "assert 'nil_mitsuba.integrator' in sys.modules and 'nil_mitsuba.sums' in sys.modules\n"
+        "print([name for name in ('exr', 'png', 'checkpoint') if 'nil_mitsuba.' + name in "
+        "sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.stdout.strip() == "[]", run.stderr
