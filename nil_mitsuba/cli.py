@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import math
 import os
@@ -13,7 +14,7 @@ import stat
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -94,6 +95,86 @@ class Stopped(click.ClickException):
         self.exit_code = 128 + number
 
 
+class PassesOption(click.Option):
+    """An option that has no meaning where a picture is rendered in one go."""
+
+
+passes_option = functools.partial(click.option, cls=PassesOption)
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """How a picture is written: the options that ``render`` and ``merge`` share."""
+
+    png: str | None
+    exposure: float
+    filmic: bool
+    denoise: bool
+    compression: str
+
+    def output_to(self, exr_path: Path, png_path: Path | None,
+                  layers: tuple[str, ...]) -> Output:
+        return Output(exr_path, png_path, self.exposure, self.filmic, self.compression,
+                      self.denoise, layers)
+
+
+@dataclass(frozen=True)
+class RenderOptions(PictureOptions):
+    """The options of ``render``, and its argument, as click has checked them."""
+
+    scene: str
+    output: str | None
+    layers: str | None
+    spp: int | None
+    seconds: float | None
+    noise: float | None
+    pass_spp: int | None
+    seed: int
+    checkpoint: str | None
+    resume: bool
+    passes: tuple[int, int] | None
+    scheduler: str | None
+    workers: int | None
+    mode: str
+    define: tuple[tuple[str, str], ...]
+    sensor: int
+    threads: int | None
+    quiet: bool
+    verbose: int
+    properties: tuple[tuple[str, str], ...]
+    fit: bool
+
+    @property
+    def clustered(self) -> bool:
+        return bool(self.scheduler or self.workers)
+
+    def job(self, rules: stills.Rules, sums: Path) -> jobs.Job:
+        """The job that these options describe."""
+        properties = dict(self.properties)
+        if self.layers is not None:
+            properties["aovs"] = self.layers
+        pass_spp = self.pass_spp or stills.pass_spp_of(sums, self.resume)
+        return jobs.Job(self.scene, self.mode, dict(self.define), properties, self.sensor,
+                        self.seed, rules.spp, pass_spp, denoise=self.denoise, fit=self.fit)
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The files to write; a part of a picture is none yet."""
+
+    exr: Path | None
+    png: Path | None
+    sums: Path
+
+    @property
+    def pictures(self) -> list[Path]:
+        return [path for path in (self.exr, self.png) if path]
+
+    def output(self, options: PictureOptions, layers: tuple[str, ...]) -> Output:
+        assert self.exr, "a part has only sums"
+        return options.output_to(self.exr, self.png, layers)
+
+
 @click.group()
 @click.version_option(__version__, message="%(prog)s %(version)s")
 def cli():
@@ -109,7 +190,7 @@ def picture_options(command):
                      help="Brighten the PNG picture by so many stops."),
         click.option("--filmic", is_flag=True,
                      help="Let the PNG picture's highlights fade out as film does."),
-        click.option("--denoise", is_flag=True,
+        passes_option("--denoise", is_flag=True,
                      help="Remove noise; the noisy picture stays as a layer."),
         click.option("--compression", type=click.Choice(list(exr.COMPRESSIONS)), default="zip",
                      show_default=True, help="Of the EXR file; dwaa and dwab are lossy."),
@@ -124,25 +205,25 @@ def picture_options(command):
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
 )
 @picture_options
-@click.option("--layers", metavar="A,B,…", help="Layers beside the picture: distance, position, "
+@passes_option("--layers", metavar="A,B,…", help="Layers beside the picture: distance, position, "
               "normal, albedo, cell, shape, samples.")
 @click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's, "
               "or with --time or --noise no limit]")
-@click.option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
-@click.option("--noise", type=Range(0, min_open=True), metavar="ERROR",
+@passes_option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
+@passes_option("--noise", type=Range(0, min_open=True), metavar="ERROR",
               help="Stop at this relative error, such as 0.02; pixels that are infinite or not a "
               "number are left out.")
-@click.option("--pass-spp", type=click.IntRange(1), help="Samples per pixel in each pass. This "
+@passes_option("--pass-spp", type=click.IntRange(1), help="Samples per pixel in each pass. This "
               "and --spp, as a file tells them, render its picture again.  [default: by size and "
               "rules]")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option("--checkpoint", metavar="FILE" + SUMS, help="Keep the samples in this file, when the "
-              "picture is done, too.  [default: one beside the picture until it is done]")
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint, if there is one.")
-@click.option("--passes", type=PassRange(), help='Render these passes only, into a file for '
+@passes_option("--checkpoint", metavar="FILE" + SUMS, help="Keep the samples in this file, when "
+              "the picture is done, too.  [default: one beside the picture until it is done]")
+@passes_option("--resume", is_flag=True, help="Go on from the checkpoint, if there is one.")
+@passes_option("--passes", type=PassRange(), help='Render these passes only, into a file for '
               '"nil-mitsuba merge".')
-@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
-@click.option("--workers", type=click.IntRange(1), help="Render in so many processes.")
+@passes_option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
+@passes_option("--workers", type=click.IntRange(1), help="Render in so many processes.")
 @click.option("-m", "--mode", metavar="VARIANT", default="llvm_ad_rgb", show_default=True)
 @click.option(
     "-D", "--define", type=Assignment(), multiple=True,
@@ -160,55 +241,13 @@ def picture_options(command):
     help='Set a property of the integrator "nil", such as twist=0 or cell_origin=-1,-1,-1.',
 )  # fmt: skip
 @click.option("--fit", is_flag=True, help="Fit the cell to the scene's bounding box.")
-def render(scene, define, properties, layers, fit, sensor, mode, threads, verbose, **options):
+def render(**options):
     """Render a scene with the integrator "nil", whatever integrator it names.
 
     The letters are those of Mitsuba's own command. Ctrl-C and SIGTERM finish the pass that is being
     rendered, save the samples and write the picture so far.
     """
-    scene_path = Path(scene)
-    if not scene_path.is_file():
-        what = "is not a file" if scene_path.exists() else "does not exist"
-        raise click.ClickException(f'the scene "{scene}" {what}.')
-    paths = _paths(scene_path, options)
-    try:
-        rules = stills.check_rules(options["spp"], options["seconds"], options["noise"])
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    note = _silence if options["quiet"] else _note
-    clustered = bool(options["scheduler"] or options["workers"])
-    if clustered:
-        if options["scheduler"] and options["workers"]:
-            raise click.UsageError("--workers starts a cluster here, --scheduler names another.")
-        from . import cluster  # noqa: F401 - says what it needs before anything is rendered
-    options |= {"worker_threads": threads, "layers": layers}
-
-    _set_variant(mode, verbose)
-    if options["denoise"]:
-        _require_denoiser()
-    threads = threads or dr.thread_count()
-    dr.set_thread_count(threads)
-    properties = dict(properties)
-    if layers is not None:
-        properties["aovs"] = layers
-    sums_path = paths["sums"]
-    pass_spp = options["pass_spp"] or stills.pass_spp_of(sums_path, options["resume"])
-    job = jobs.Job(scene, mode, dict(define), properties, sensor, options["seed"], rules.spp,
-                   pass_spp, denoise=options["denoise"], fit=fit)
-    opened = jobs.open_scene(job, note)
-    about = {
-        "scene": scene,
-        "integrator": str(opened.integrator),
-        "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
-    }
-    if not hasattr(opened.integrator, "view"):
-        _render_in_one_go(opened, about, paths, options)
-        return
-    if options["resume"] and not sums_path.exists():
-        note(f'there is no checkpoint "{sums_path}": beginning with the first pass.')
-    still = _still(opened, rules, options)
-    job = replace(opened.job, path=str(scene_path.absolute()), pass_spp=still.passes.spp)
-    _render_still(still, about, opened.layers, paths, options, job if clustered else None)
+    _render(RenderOptions(**options))
 
 
 @cli.command()
@@ -216,13 +255,14 @@ def render(scene, define, properties, layers, fit, sensor, mode, threads, verbos
 @click.option("-o", "--output", metavar="OUT.exr", required=True,
               help=f"With the suffix {SUMS}, the parts in one file.")
 @picture_options
-def merge(parts, output, **options):
+def merge(parts, output, **picture):
     """Join parts that "nil-mitsuba render --passes" has rendered, to a picture."""
+    options = PictureOptions(**picture)
     sums_only = Path(output).suffix == SUMS
-    if sums_only and (options["png"] or options["denoise"]):
+    if sums_only and (options.png or options.denoise):
         raise click.UsageError(f"--png and --denoise go with a picture, not with {SUMS}.")
     exr_path = _output_path(output, SUMS if sums_only else ".exr", "-o")
-    png_path = _output_path(options["png"], ".png", "--png") if options["png"] else None
+    png_path = _output_path(options.png, ".png", "--png") if options.png else None
     if sums_only and exr_path.exists() and not any(map(exr_path.samefile, parts)):
         raise click.ClickException(
             f'"{exr_path}" holds samples and is none of the parts: remove it, or name another file.'
@@ -242,19 +282,17 @@ def merge(parts, output, **options):
         commands.append(further.about.get("commandLine"))
     missing = stills.missing(state)
     if missing:
-        _note(f"the passes {name_passes(missing)} of 0:{state.about['count']} are "
-              "missing.")
+        _note(f"the passes {name_passes(missing)} of 0:{state.about['count']} are missing.")
     # All that it took, line by line as in a script
     commands.append(shlex.join(["nil-mitsuba", *sys.argv[1:]]))
     state.about["commandLine"] = "\n".join(dict.fromkeys(filter(None, commands)))
     if sums_only:
         checkpoint.save(exr_path, state)
     else:
-        if options["denoise"]:
+        if options.denoise:
             _require_denoiser()
             _require_guides(state.settings)
-        layers = tuple(state.settings["layers"])
-        out = _output({"exr": exr_path, "png": png_path}, options, layers)
+        out = options.output_to(exr_path, png_path, tuple(state.settings["layers"]))
         out.write(stills.picture_of(state), metadata_of(state))
     for path in filter(None, (exr_path, png_path)):
         click.echo(path)
@@ -306,18 +344,54 @@ def tidy(text: str) -> str:
 # -------------------------------------------------------------------- rendering
 
 
-def _still(opened: jobs.Opened, rules: stills.Rules, options: dict) -> stills.Still:
+def _render(options: RenderOptions) -> None:
+    scene = Path(options.scene)
+    if not scene.is_file():
+        what = "is not a file" if scene.exists() else "does not exist"
+        raise click.ClickException(f'the scene "{scene}" {what}.')
+    paths = _paths(scene, options)
+    try:
+        rules = stills.check_rules(options.spp, options.seconds, options.noise)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    if options.clustered:
+        if options.scheduler and options.workers:
+            raise click.UsageError("--workers starts a cluster here, --scheduler names another.")
+        from . import cluster  # noqa: F401 - says what it needs before anything is rendered
+    if options.denoise:
+        _require_denoiser()
+
+    note = _silence if options.quiet else _note
+    _set_variant(options.mode, options.verbose)
+    dr.set_thread_count(options.threads or dr.thread_count())
+    opened = jobs.open_scene(options.job(rules, paths.sums), note)
+    about = {
+        "scene": options.scene,
+        "integrator": str(opened.integrator),
+        "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
+    }
+    if hasattr(opened.integrator, "view"):
+        if options.resume and not paths.sums.exists():
+            note(f'there is no checkpoint "{paths.sums}": beginning with the first pass.')
+        still = _still(opened, rules, options)
+        _render_still(still, opened, about, paths, options)
+    else:
+        _render_in_one_go(opened, about, paths, options)
+
+
+def _still(opened: jobs.Opened, rules: stills.Rules, options: RenderOptions) -> stills.Still:
     """The still that is to be rendered, checked against what is to become of it."""
     still = opened.still(rules)
-    if options["denoise"]:
+    if options.denoise:
         _require_guides(still.settings)
-    if options["png"] and not still.settings["film"]["pixel_format"]:
+    if options.png and not still.settings["film"]["pixel_format"]:
         raise click.ClickException(
             f'--png needs a film with colours, and "{still.settings["film"]["type"]}" has none.'
         )
-    if options["passes"]:
+    if options.passes:
         stills.film_of(still.settings["film"])  # what "merge" will need
-        first, stop = options["passes"]
+        first, stop = options.passes
+        assert still.count is not None, "--passes goes with no other rule than --spp"
         if stop > still.count:
             raise click.ClickException(
                 f"there are no passes {first}:{stop}: the picture consists of the passes "
@@ -326,30 +400,28 @@ def _still(opened: jobs.Opened, rules: stills.Rules, options: dict) -> stills.St
     return still
 
 
-def _render_still(still: stills.Still, about: dict, layers, paths: dict, options: dict,
-                  job: jobs.Job | None) -> None:
-    """Render in passes, until all are done, a rule is met or a signal comes; write the files.
-
-    A job goes to a cluster.
-    """
-    sums_path, count = paths["sums"], still.count
-    first, stop = options["passes"] or (0, count)
-    state = still.start(sums_path, options["resume"])
-    if options["passes"]:
+def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: Paths,
+                  options: RenderOptions) -> None:
+    """Render in passes, until all are done, a rule is met or a signal comes; write the files."""
+    sums_path, count = paths.sums, still.count
+    first, stop = options.passes or (0, count)
+    state = still.start(sums_path, options.resume)
+    if options.passes:
         # Passes that are there already may be others
         wanted = state.sums.count + len(list(still.todo(state, first, stop)))
         still.rules = stills.Rules(spp=wanted * still.passes.spp)
     state.about = about | ({"count": count} if count else {})
 
     parts = (still.render(index) for index in still.todo(state, first, stop))
-    if job:
+    if options.clustered:
         from . import cluster
 
-        parts = cluster.render(still, job, still.todo(state, first, stop), options["scheduler"],
-                               options["workers"], options["worker_threads"],
+        job = replace(opened.job, path=os.path.abspath(options.scene), pass_spp=still.passes.spp)
+        parts = cluster.render(still, job, still.todo(state, first, stop), options.scheduler,
+                               options.workers or 1, options.threads,
                                lambda sentence: _note(tidy(sentence)))
     saver = stills.Saver(sums_path, _note)
-    with contextlib.closing(parts), _Bar(still, options["quiet"]) as bar:
+    with contextlib.closing(parts), _Bar(still, options.quiet) as bar:
         state, number = still.accumulate(state, parts, bar, saver)
     if not state.sums.count:
         raise Stopped("interrupted before the first pass, nothing was written.", number or 0)
@@ -358,15 +430,15 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
     with stills.interruption() as signals:
         kept = saver.save(state)
     number = next(iter(signals), number)
-    if options["passes"]:
+    if options.passes:
         written = [sums_path] if kept else []
     else:
-        written = list(filter(None, (paths["exr"], paths["png"])))
+        written = paths.pictures
         there = (f'The samples are in "{sums_path}": the same command with --resume writes the '
                  "picture." if kept else "The samples could not be saved.")
         try:
             with stills.interruption(patience=0) as signals:
-                _output(paths, options, layers).write(
+                paths.output(options, opened.layers).write(
                     stills.picture_of(state, still.film), metadata_of(state)
                 )
         except KeyboardInterrupt:
@@ -383,21 +455,20 @@ def _render_still(still: stills.Still, about: dict, layers, paths: dict, options
             f"{there if kept else 'the samples could not be saved'}.",
             number,
         )
-    if options["passes"] and not kept:
+    if options.passes and not kept:
         sys.exit(1)  # the saver has said why
-    if not (options["checkpoint"] or options["passes"]):
+    if not (options.checkpoint or options.passes):
         sums_path.unlink(missing_ok=True)
 
 
-def _render_in_one_go(opened: jobs.Opened, about: dict, paths: dict, options: dict) -> None:
+def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
+                      options: RenderOptions) -> None:
     """Render with a wrapper of Mitsuba's around "nil", which knows no passes."""
-    names = {"noise": "noise", "time": "seconds", "resume": "resume", "passes": "passes",
-             "pass-spp": "pass_spp", "checkpoint": "checkpoint", "denoise": "denoise",
-             "layers": "layers", "scheduler": "scheduler", "workers": "workers"}
-    given = [name for name, key in names.items() if options[key]]
+    given = [parameter.opts[0] for parameter in click.get_current_context().command.params
+             if isinstance(parameter, PassesOption) and getattr(options, str(parameter.name))]
     if given:
         raise click.ClickException(
-            f"--{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
+            f"{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
         )
     job, scene = opened.job, opened.scene
     film = scene.sensors()[job.sensor].film()
@@ -413,8 +484,8 @@ def _render_in_one_go(opened: jobs.Opened, about: dict, paths: dict, options: di
     }
     channels = [field.name for field in film.bitmap().struct_()]
     picture = stills.Picture(channels, image, {}, exr.component_format(film))
-    _output(paths, options, ()).write(picture, metadata)
-    for path in filter(None, (paths["exr"], paths["png"])):
+    paths.output(options, ()).write(picture, metadata)
+    for path in paths.pictures:
         click.echo(path)
 
 
@@ -460,30 +531,23 @@ class _Bar:
 # ----------------------------------------------------------------------- output
 
 
-def _paths(scene: Path, options: dict) -> dict[str, Path | None]:
-    """The files to write: "exr", "png" and "sums"."""
-    output, passes = options["output"], options["passes"]
-    if passes:
-        for name in ("png", "denoise", "checkpoint", "noise", "seconds"):
-            if options[name]:
-                raise click.UsageError(
-                    "--passes renders a part of --spp samples: it goes with none of --png, "
-                    "--denoise, --checkpoint, --noise and --time."
-                )
-        part = output or scene.with_suffix(f".{passes[0]}-{passes[1]}{SUMS}")
-        return {"exr": None, "png": None, "sums": _output_path(part, SUMS, "--passes")}
-    exr_path = _output_path(output or scene.with_suffix(".exr"), ".exr", "-o")
-    sums = options["checkpoint"] or exr_path.with_suffix(SUMS)
-    return {
-        "exr": exr_path,
-        "png": _output_path(options["png"], ".png", "--png") if options["png"] else None,
-        "sums": _output_path(sums, SUMS, "--checkpoint"),
-    }
-
-
-def _output(paths: dict, options: dict, layers: tuple[str, ...]) -> Output:
-    return Output(paths["exr"], paths["png"], options["exposure"], options["filmic"],
-                  options["compression"], options["denoise"], layers)
+def _paths(scene: Path, options: RenderOptions) -> Paths:
+    if options.passes:
+        if (options.png or options.denoise or options.checkpoint or options.noise
+                or options.seconds):
+            raise click.UsageError(
+                "--passes renders a part of --spp samples: it goes with none of --png, "
+                "--denoise, --checkpoint, --noise and --time."
+            )
+        first, stop = options.passes
+        part = options.output or scene.with_suffix(f".{first}-{stop}{SUMS}")
+        return Paths(None, None, _output_path(part, SUMS, "--passes"))
+    exr_path = _output_path(options.output or scene.with_suffix(".exr"), ".exr", "-o")
+    return Paths(
+        exr_path,
+        _output_path(options.png, ".png", "--png") if options.png else None,
+        _output_path(options.checkpoint or exr_path.with_suffix(SUMS), SUMS, "--checkpoint"),
+    )
 
 
 def _require_denoiser() -> None:
