@@ -11,16 +11,8 @@ __version__ = "0.1.0"
 llvm.select()  # Dr.Jit looks for LLVM once, while it is imported: everything else comes after
 
 from . import geometry, registration  # noqa: E402
+from .stills import render  # noqa: E402
 
 registration.install()
 
 __all__ = ["geometry", "render", "__version__"]
-
-
-def __getattr__(name):
-    # Late, since nothing else needs what stills are made with.
-    if name == "render":
-        from .stills import render
-
-        return render
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -82,9 +82,9 @@ class PassRange(click.ParamType):
 
     def convert(self, value, param, ctx):
         match = re.fullmatch(r"(\d+):(\d+)", value)
-        if not match or int(match[1]) >= int(match[2]):
-            self.fail(f'expected a:b with a < b, such as 0:8, and "{value}" is not.', param, ctx)
-        return int(match[1]), int(match[2])
+        if match and int(match[1]) < int(match[2]):
+            return int(match[1]), int(match[2])
+        self.fail(f'expected a:b with a < b, such as 0:8, and "{value}" is not.', param, ctx)
 
 
 class Stopped(click.ClickException):

@@ -12,7 +12,7 @@ from . import geometry
 from .camera import Camera
 from .interaction import offset, surface_interaction
 from .layers import LAYERS, RENDERED, channel_names
-from .lights import Lights, lobe_angle
+from .lights import Lights, LightSample, lobe_angle
 from .passes import Passes
 from .quotient import Space, multiply_cells, shape_box
 from .tracer import Cone, Tracer
@@ -211,7 +211,7 @@ class NilIntegrator(ADIntegrator):
 
             wo = mi.Vector3f(0, 0, 1)
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            light = None
+            light = dr.zeros(LightSample)
             if sampling:
                 light = lights.sample(si, sampler, active_em)
                 active_em &= dr.any(light.weight != 0)

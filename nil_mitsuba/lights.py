@@ -278,7 +278,7 @@ class Lights:
 
     def _image_of(self, p, q, u1, u2):
         """An image (cells) of the point ``q`` of the unit cube, and its probability."""
-        if not self.space.quotient:
+        if self.images is None:
             return q, mi.Float(1)
         g, probability = self.images.choose(p, q, u1, u2)
         return mi.Point3f(geometry.multiply(mi.Point3f(g), q, self.space.twist)), probability
@@ -401,7 +401,7 @@ class Lights:
         cosine = dr.abs(dr.dot(si.n, hit.arrival))
         half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance
         pdf = per_area * density / (stretch * cosine)
-        if space.quotient:
+        if self.images is not None:
             pdf *= self.images.probability(p, q, g)
         return dr.select(lit & (half_turn < dr.pi) & (cosine > 0), pdf, 0)
 
