@@ -8,10 +8,10 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
-from . import geometry
+from . import geometry, parameters
 from .camera import Camera
 from .interaction import offset, surface_interaction
-from .layers import LAYERS, RENDERED, channel_names
+from .layers import LAYERS, channel_names
 from .lights import Lights, LightSample, lobe_angle
 from .passes import Passes
 from .quotient import Space, multiply_cells, shape_box
@@ -46,38 +46,29 @@ class NilIntegrator(ADIntegrator):
     a list such as "distance, normal"). It offers no gradients and no participating media.
     """
 
+    _given: dict = {}  # Parameters that are not left to their defaults
+
     def __init__(self, props: mi.Properties):
         super().__init__(mi.Properties())
-        self.max_depth = _integer(props, "max_depth", -1)
-        if self.max_depth < 0 and self.max_depth != -1:
-            raise RuntimeError('"max_depth" must be set to -1 (infinite) or a value >= 0')
-        self.rr_depth = _integer(props, "rr_depth", 5)
-        if self.rr_depth <= 0:
-            raise RuntimeError('"rr_depth" must be set to a value greater than zero!')
-        self.hide_emitters = _boolean(props, "hide_emitters", False)
-
-        self.quotient = _boolean(props, "quotient", True)
-        self.twist = _number(props, "twist", 1.0)
-        if self.quotient and self.twist != round(self.twist):
-            raise RuntimeError(
-                f'"twist" = {self.twist:g} does not glue the faces of the cube: use an integer '
-                f'such as {math.floor(self.twist)} or {math.ceil(self.twist)}, or set "quotient" '
-                "to false"
-            )
-        self.cell_origin = _point(props, "cell_origin")
-        self.cell_size = _positive(props, "cell_size", 1.0)
-        self.tolerance = _positive(props, "tolerance", 0.25)
         # Tests switch emitter sampling off: estimates are then exact where furnaces are.
         self.emitter_sampling = True
-        self.layers = _layers(props)
-        self.max_distance = math.inf
-        if self.quotient or "max_distance" in props:
-            self.max_distance = _positive(props, "max_distance", 12.0)
+        self._set({name: props.get(name) for name in props.keys()})
+
+    def __setattr__(self, name, value):
+        # What is set on an integrator that is there is checked as what a scene file says
+        if name == "emitter_sampling":
+            super().__setattr__(name, value)
+        else:
+            self._set(self._given | {name: value})
+
+    def _set(self, given: dict) -> None:
+        for name, value in (parameters.checked(given) | {"_given": given}).items():
+            super().__setattr__(name, value)
 
     def to_string(self) -> str:
         return (
             f"NilIntegrator[\n  twist = {self.twist:g},\n  quotient = {self.quotient},\n"
-            f"  cell_origin = {self.cell_origin},\n  cell_size = {self.cell_size:g},\n"
+            f"  cell_origin = {list(self.cell_origin)},\n  cell_size = {self.cell_size:g},\n"
             f"  tolerance = {self.tolerance:g},\n  max_distance = {self.max_distance:g},\n"
             f"  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
             f"  hide_emitters = {self.hide_emitters}\n]"
@@ -315,7 +306,7 @@ def mis_weight(pdf_a, pdf_b):
 
 def _warn_of_what_is_ignored(scene, integrator):
     """Log one warning each for shapes outside the quotient's cube and for media."""
-    lower = integrator.cell_origin
+    lower = list(integrator.cell_origin)
     upper = [c + integrator.cell_size for c in lower]
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
     for shape in scene.shapes():
@@ -338,7 +329,7 @@ class View:
 
     def __init__(self, scene: mi.Scene, integrator: NilIntegrator):
         self.scene = scene
-        self.space = Space(integrator.twist, integrator.quotient, integrator.cell_origin,
+        self.space = Space(integrator.twist, integrator.quotient, list(integrator.cell_origin),
                            integrator.cell_size)
         self.tracer = Tracer(scene, self.space, integrator.max_distance)
         self.lights = Lights(scene, self.space, integrator.max_distance)
@@ -399,62 +390,3 @@ class View:
         for number, pointer in enumerate(pointers):
             numbers[pointer] = number
         self.shape_numbers = mi.Int32(numbers)
-
-
-# ------------------------------------------------------------------ parameters
-
-
-def _integer(props, name, default):
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise RuntimeError(f'The property "{name}" has the wrong type (expected <integer>).')
-    return value
-
-
-def _boolean(props, name, default):
-    value = props.get(name, default)
-    if not isinstance(value, bool):
-        raise RuntimeError(f'The property "{name}" has the wrong type (expected <boolean>).')
-    return value
-
-
-def _number(props, name, default):
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise RuntimeError(f'The property "{name}" has the wrong type (expected <float>).')
-    if not math.isfinite(value):
-        raise RuntimeError(f'"{name}" must be a finite number, and it is {value}')
-    return float(value)
-
-
-def _positive(props, name, default):
-    value = _number(props, name, default)
-    if value <= 0:
-        raise RuntimeError(f'"{name}" must be greater than zero, and it is {value:g}')
-    return value
-
-
-def _point(props, name):
-    value = props.get(name, [0.0, 0.0, 0.0])
-    try:
-        point = [float(value[i]) for i in range(3)]
-    except (TypeError, IndexError, KeyError):
-        raise RuntimeError(
-            f'The property "{name}" has the wrong type (expected <point> or <vector>).'
-        ) from None
-    if not all(map(math.isfinite, point)):
-        raise RuntimeError(f'"{name}" must be finite, and it is {point}')
-    return point
-
-
-def _layers(props):
-    """The chosen layers in the order of `RENDERED`, each once."""
-    text = props.get("aovs", "")
-    if not isinstance(text, str):
-        raise RuntimeError('The property "aovs" has the wrong type (expected <string>).')
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in RENDERED:
-            raise RuntimeError(f'"aovs" names the layer "{name}", which is none of '
-                               f"{', '.join(RENDERED)}")
-    return tuple(layer for layer in RENDERED if layer in names)

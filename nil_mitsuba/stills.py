@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, checkpoint
+from . import __version__, checkpoint, parameters
 from .checkpoint import Checkpoint
 from .exr import component_format
 from .layers import LAYERS, channel_names
@@ -39,12 +39,6 @@ LOOK_SAMPLES = 2**19
 
 # The variance between fewer passes says little about a picture of few pixels.
 NOISE_PASSES = 4
-
-# Parameters of the integrator that determine the picture.
-PARAMETERS = (
-    "twist", "quotient", "cell_origin", "cell_size", "tolerance", "max_distance",
-    "max_depth", "rr_depth", "hide_emitters",
-)  # fmt: skip
 
 # Mitsuba's names for the pixel formats of a film, in a scene and in the film's description.
 PIXEL_FORMATS = {"y": "luminance", "ya": "luminance_alpha"}
@@ -147,7 +141,8 @@ class Still:
             "sampler": self.passes.sampler.class_name(),
             "film": film_settings(self.film),
             "layers": list(integrator.layers),
-            "integrator": {name: _plain(getattr(integrator, name)) for name in PARAMETERS},
+            "integrator": {name: _plain(getattr(integrator, name)) for name in parameters.NAMES
+                           if name != "aovs"},
             "variant": mi.variant(),
             "versions": versions(),
         }
