@@ -65,7 +65,7 @@ class Images:
     functions. The nearest image and the nearest column of images get shares of their own.
     """
 
-    # All three by experiment, against a choice in proportion to 1/A (examples/emitter_sampling.py).
+    # All three by experiment, against a choice in proportion to 1/A (benchmarks/emitter_sampling).
     # Cells: below, an image's interval does not tell 1/A from a constant.
     SOFTENING = 0.3
     # Cells: where the column of images along one fibre is as bright as all the others.

@@ -20,7 +20,7 @@ from .quotient import Space, exit_through_face, opaque, scene_box, through_face
 # A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
 # rough bounces, and towards lights. What a chord has missed cannot be found again, while what it
 # has met by mistake can, so the error is one-sided: an image's mean allows less than its edges do.
-# On the bent Cornell box (examples/speed.py) twice as much in the place of one of them moves the
+# On the bent Cornell box (benchmarks/speed.py) twice as much in the place of one of them moves the
 # mean by 0.2 %, or squares of 4×4 pixels at contacts by more than the noise of 1,024 samples.
 SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.15, 0.15, 0.1
 # Rays that are seen are allowed at their start what they are at this distance (cells): of the many

@@ -14,9 +14,6 @@ import pytest  # noqa: E402
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 
-sys.path.append(str(ROOT / "examples"))  # what they measure with is tested, too
-
-
 @pytest.fixture
 def rgb():
     """Mitsuba in the variant that most tests use; returns the module."""

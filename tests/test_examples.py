@@ -1,4 +1,5 @@
 import re
+import runpy
 import subprocess
 import sys
 
@@ -73,14 +74,11 @@ def test_any_mesh_stands_in_the_cube(rgb, tmp_path):
     run("own_mesh.py", str(mesh), "--up", "y", "-o", str(picture), "--size", "32", "--spp", "1")
     shows_something(rgb, picture)
 
-    sys.path.insert(0, str(ROOT / "examples"))
-    try:
-        from own_mesh import EXTENT, FOOT, fitted
-    finally:
-        sys.path.pop(0)
-    box = rgb.load_dict(fitted(mesh, "y")).bbox()
-    assert dr.allclose(box.min, [FOOT[0] - EXTENT / 18, FOOT[1] - EXTENT / 18, FOOT[2]], atol=1e-5)
-    assert dr.allclose(box.max.z, FOOT[2] + EXTENT, atol=1e-5)
+    own_mesh = runpy.run_path(str(ROOT / "examples" / "own_mesh.py"))
+    foot, extent = own_mesh["FOOT"], own_mesh["EXTENT"]
+    box = rgb.load_dict(own_mesh["fitted"](mesh, "y")).bbox()
+    assert dr.allclose(box.min, [foot[0] - extent / 18, foot[1] - extent / 18, foot[2]], atol=1e-5)
+    assert dr.allclose(box.max.z, foot[2] + extent, atol=1e-5)
 
 
 def test_own_mesh_says_what_it_reads():

@@ -9,52 +9,22 @@ import math
 
 import drjit as dr
 import pytest
-from drjit.llvm import PCG32, Array3f, Array3f64, Bool, Float, Float64
+from drjit.llvm import Array3f, Array3f64, Bool, Float, Float64
 
-import face_crossing
-import report_formulas
-import truth
-
-
-def first_crossing(p, v, axis, c, t_max, twist=1):
-    """``face_crossing.first_crossing`` in a kernel of its own, one for all twists and planes."""
-    value_t = dr.value_t(type(p))
-    p, v, c = type(p)(p), type(v)(v), dr.zeros(value_t, dr.width(p)) + c
-    dr.eval(p, v, c)
-    t = face_crossing.first_crossing(p, v, axis, c, dr.opaque(value_t, t_max),
-                                     dr.opaque(value_t, twist))
-    dr.eval(t)
-    return t
-
-
-def random_rays(count, low=-2.0, high=2.0, seed=1):
-    """Starts in a cube, directions uniform, and a number in [0, 1), all as float32 holds them."""
-    rng = PCG32(count, initstate=seed)
-    p = Array3f(*(Float(low + (high - low) * rng.next_float64()) for _ in range(3)))
-    w = 2 * rng.next_float64() - 1
-    s, c = dr.sincos(2 * math.pi * rng.next_float64())
-    r = dr.sqrt(1 - w * w)
-    v = Array3f(Float(r * c), Float(r * s), Float(w))
-    u = Float(rng.next_float64())
-    dr.eval(p, v, u)
-    return p, v, u
-
-
-def tangent_rays(count, axis, twist, t_max, seed=2):
-    """Rays that touch the plane they are given with, to 1e-2 … 1e-14 of it on either side."""
-    rng = PCG32(count, initstate=seed)
-    p, v, _ = random_rays(count, seed=seed + 1)
-    p, v = Array3f64(p), Array3f64(v)
-    # A frame direction without the coordinate component ``axis``
-    v = Array3f64(0 if axis == 0 else v.x, 0 if axis == 1 else v.y,
-                  -twist * p.x * v.y if axis == 2 else v.z)
-    v /= dr.norm(v)
-    clearance = dr.copysign(dr.exp2(-7 - 40 * rng.next_float64()), rng.next_float64() - 0.5)
-    c = p[axis] + clearance
-    # Half of the way has to lie before the touch, half behind it
-    p, v = truth.flow(p, v, -0.5 * t_max * rng.next_float64(), Float64(twist))
-    dr.eval(p, v, c)
-    return p, v, c
+from benchmarks import report_formulas, truth
+from benchmarks.failures.crossings import (
+    FURTHER,
+    LONGEST,
+    beyond,
+    crossings_ahead,
+    crossings_just_reached,
+    first_crossing,
+    random_rays,
+    rays_off,
+    sign_change,
+    tangent_rays,
+)
+from benchmarks.tracers import SPREAD, Traced, allowance
 
 
 class Plane:
@@ -69,14 +39,8 @@ class Plane:
     def contains(self, p):
         return Bool(True)
 
-
 def scanned(p, v, axis, c, t_max, twist, step=truth.STEP):
     return truth.first_hit([Plane(axis, c)], p, v, t_max, twist, quotient=False, step=step).t
-
-
-def beyond(t, nearer, farther, slack):
-    """Whether t is not between the crossings of a nearer and a farther plane."""
-    return ~((t >= nearer - slack) & (t <= farther + slack))
 
 
 def check_against_scan(p, v, c, axis, twist, t_max=12.0):
@@ -105,7 +69,6 @@ def check_against_scan(p, v, c, axis, twist, t_max=12.0):
         assert len(wrong) == 0
     return dr.count(dr.isfinite(t))[0] / count
 
-
 def check_faces(count, axis, twist):
     p, v, u = random_rays(count)
     p, v, c = Array3f64(p), Array3f64(v), 8 * Float64(u) - 4
@@ -114,18 +77,15 @@ def check_faces(count, axis, twist):
     # With hardly a twist a tangent ray runs along its plane
     assert crossing > 0.4 or abs(twist) < 0.1
 
-
 @pytest.mark.parametrize("twist", [0, 1e-6, 1, -3])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_first_crossing_of_a_face_is_that_of_the_scan(axis, twist):
     check_faces(4000, axis, twist)
 
-
 @pytest.mark.verify
 @pytest.mark.parametrize("axis, twist", [(0, 1), (1, 1), (2, 1), (2, -2)])
 def test_first_crossings_of_a_million_rays_are_those_of_the_scan(axis, twist):
     check_faces(800_000, axis, twist)
-
 
 def largest_coordinate(p, v, t_max, twist):
     """Largest coordinate along each ray, from 20 steps."""
@@ -135,7 +95,6 @@ def largest_coordinate(p, v, t_max, twist):
         largest = dr.maximum(largest, dr.max(dr.abs(q)))
         dr.eval(largest)
     return largest
-
 
 def check_float32(count, axis, twist):
     """``count`` random rays and as many tangent ones in float32, for a plane off by what ``flow``
@@ -148,7 +107,7 @@ def check_float32(count, axis, twist):
         p, v, c = rays
         t = Float64(first_crossing(p, v, axis, c, t_max, twist))
         p, v, c = Array3f64(p), Array3f64(v), Float64(c)
-        # The limit of ``flow`` for lengths up to 5, tests/reference_geometry.py
+        # The limit of ``flow`` for lengths up to 5, reference_geometry.py
         ε = 2e-6 * max(1, abs(twist) / 2) * (1 + largest_coordinate(p, v, t_max, twist))
         side = dr.select(c > p[axis], 1, Float64(-1))
         nearer = first_crossing(p, v, axis, c - side * ε, 2 * t_max, twist)
@@ -161,12 +120,10 @@ def check_float32(count, axis, twist):
         assert dr.count(wrong)[0] == 0
         assert dr.all(~dr.isnan(t))
 
-
 @pytest.mark.parametrize("twist", [1e-6, 1, -3])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_first_crossing_of_a_face_in_float32_is_right_to_rounding(axis, twist):
     check_float32(40_000, axis, twist)
-
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist", [1, -3])
@@ -177,61 +134,6 @@ def test_first_crossings_of_z_of_a_million_rays_in_float32_are_right_to_rounding
 # ---------------------------------------------------------------------------
 #  What other methods give
 # ---------------------------------------------------------------------------
-
-# Length of chords, or the tolerance for them
-KNOBS = {"printed form": 0.05, "Runge–Kutta 4": 0.05, "Dormand–Prince": 1e-4}
-# Crossings are looked for up to this length, and a little further, so that none is lost at its end
-LONGEST, FURTHER = 20.0, 20.05
-
-
-def sign_change(name, p, v, axis, c, t_max):
-    """First sign change of the coordinate between chords, and the secant's root."""
-    import tracing_methods
-
-    steps = tracing_methods.METHODS[name](dr.opaque(Float, KNOBS[name]), dr.opaque(Float, 1))
-    t_max = dr.opaque(Float, t_max)
-
-    def step(t, state, before, found):
-        state, h, good = steps.step(state, t_max - t)
-        now = state["p"][axis] - c
-        crossed = good & (before * now <= 0)
-        found = dr.select(crossed, t + h * before / (before - now), found)
-        return (dr.select(good, dr.select(h < t_max - t, t + h, t_max), t), state,
-                dr.select(good, now, before), found)
-
-    state = dr.zeros(Float, dr.width(p)), steps.start(p, v), p[axis] - c, dr.full(
-        Float, math.inf, dr.width(p))
-    return dr.while_loop(state, lambda t, state, before, found: (t < t_max) & (found == math.inf),
-                         step)[3]
-
-
-def rays_off(found, exact, allowed=1e-3, longest=LONGEST):
-    """Rays whose crossing is off, missed, or none in truth."""
-    found = Float64(found)
-    found = dr.select(dr.isfinite(found) & (found > 0), found, math.inf)
-    judged = dr.minimum(found, exact) <= longest
-    return dr.count(judged & ~(dr.abs(found - exact) <= allowed))[0]
-
-
-def crossings_ahead(vector_t, axis, count=100_000):
-    """Rays from the unit cell, the face ahead of each, and where it is crossed in truth."""
-    p, v, _ = random_rays(count, 0, 1)
-    p, v = vector_t(p), vector_t(v)
-    face = dr.select(v[axis] > 0, dr.value_t(vector_t)(1), 0)
-    exact = first_crossing(Array3f64(p), Array3f64(v), axis, Float64(face), FURTHER)
-    return p, v, face, exact
-
-
-def crossings_just_reached(count=100_000):
-    """Rays, planes z = c that they cross twice within less than a step, touching them to 1e-2 …
-    1e-5 cells (closer, rounding decides whether they do), and where they cross them first."""
-    p, v, c = tangent_rays(count, 2, 1, 12.0)
-    p, v, c = Array3f(p), Array3f(v), Float(c)
-    exact, *moved = (first_crossing(Array3f64(p), Array3f64(v), 2, Float64(c) + shift, 12.0)
-                     for shift in (0, -1e-5, 1e-5))
-    sure = dr.compress(dr.abs(moved[1] - moved[0]) < 0.01)
-    return [dr.gather(type(x), x, sure) for x in (p, v, c, exact)]
-
 
 @pytest.mark.parametrize("vector_t", [Array3f, Array3f64], ids=["float32", "float64"])
 @pytest.mark.parametrize("axis", [0, 1])
@@ -251,7 +153,6 @@ def test_the_reports_crossing_of_the_face_ahead_is_wrong_for_half_of_all_rays(ve
     # The same rays, both branches, in the same precision
     assert rays_off(first_crossing(p, v, axis, face, FURTHER), exact) == 0
 
-
 @pytest.mark.parametrize("name", ["Runge–Kutta 4", "Dormand–Prince"])
 def test_chords_of_an_ode_method_pass_faces_that_a_ray_only_just_crosses(rgb, name):
     """One in 1,000 faces ahead, one in 30 planes that are crossed twice within a chord."""
@@ -270,35 +171,13 @@ def test_chords_of_an_ode_method_pass_faces_that_a_ray_only_just_crosses(rgb, na
 #  Walls
 # ---------------------------------------------------------------------------
 
-# A camera's cone at the default tolerance, a quarter of a pixel of 1/1000
-SPREAD = 0.25e-3
-
-
-def allowance(t, twist):
-    """How far, in a coordinate, a wall may be off where |x| ≤ 1: as far as test_tracer.py allows
-    hits to be across their ray."""
-    return (2e-5 + 2e-6 * t) * math.sqrt(1 + twist**2)
-
-
-def intersect(mi, scene, p, v, twist, quotient, max_distance):
-    from nil_mitsuba.quotient import Space
-    from nil_mitsuba.tracer import Cone, Tracer
-
-    tracer = Tracer(mi.load_dict({"type": "scene", **scene}),
-                    Space(float(twist), quotient, [0, 0, 0], 1.0), max_distance)
-    p, v = mi.Point3f(p), mi.Vector3f(v)
-    hit = tracer.intersect(p, v, Cone(0, SPREAD), tracer.reach(p, v), mi.Bool(True))
-    dr.eval(hit)
-    return hit
-
-
 @pytest.mark.parametrize("twist", [0, 1e-6, 0.3, 1, 2, 3, 8])
 def test_walls_of_a_room_are_met_where_their_planes_are_crossed(rgb, twist):
     """No ray leaves the cube |x|, |y|, |z| ≤ 1 early, late, or never, through edges neither."""
     p, v, _ = random_rays(40_000, -0.99, 0.99)
-    hit = intersect(rgb, {"room": {"type": "cube"}}, p, v, twist, False, math.inf)
+    hit = Traced({"s0": {"type": "cube"}}, p, v, twist, False, math.inf)
     assert dr.all(hit.valid)
-    p, v, t = Array3f64(p), Array3f64(v), Float64(hit.distance)
+    p, v, t = Array3f64(p), Array3f64(v), hit.t
     δ = allowance(t, twist)
 
     def leaves_room(half_width):
@@ -312,7 +191,6 @@ def test_walls_of_a_room_are_met_where_their_planes_are_crossed(rgb, twist):
     wrong = dr.count(beyond(t, leaves_room(1 - δ), leaves_room(1 + δ), δ))[0]
     assert wrong == 0
 
-
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("twist", [1, -2])
 def test_a_wall_through_the_cell_is_met_through_all_other_faces(rgb, axis, twist):
@@ -324,9 +202,9 @@ def test_a_wall_through_the_cell_is_met_through_all_other_faces(rgb, axis, twist
     wall = truth.Rectangle(tuple(corner), tuple(u), tuple(w))
     p, v, _ = random_rays(count, 0, 1)
     p[axis] = dr.select(dr.abs(p[axis] - c) < 0.01, p[axis] + 0.02, p[axis])
-    hit = intersect(rgb, truth.to_mitsuba([wall], rgb), p, v, twist, True, t_max)
+    hit = Traced(truth.to_mitsuba([wall], rgb), p, v, twist, True, t_max)
 
-    p, v, t = Array3f64(p), Array3f64(v), Float64(hit.distance)
+    p, v, t = Array3f64(p), Array3f64(v), hit.t
     below = dr.select(p[axis] > c, c, c - 1)
 
     def leaves_layer(δ):
@@ -344,12 +222,11 @@ def test_a_wall_through_the_cell_is_met_through_all_other_faces(rgb, axis, twist
     assert dr.count(wrong & ~grazing)[0] == 0
     assert dr.count(wrong)[0] <= 1e-4 * count
     # The copy that was hit is the one that the plane belongs to
-    number = Float64(hit.cell[axis])
+    number = Float64(hit.g[axis])
     expected = dr.select(down, below - c, below - c + 1)
     sure = dr.abs(t - exact) < 0.01
     assert dr.count(sure & (dr.abs(number - expected) > 0.5))[0] == 0
     assert dr.count(sure)[0] > 0.5 * count
-
 
 @pytest.mark.parametrize("twist", [0, 1, -2])
 def test_a_wall_across_the_fibres_is_met_where_its_plane_is_crossed(rgb, twist):
@@ -358,9 +235,9 @@ def test_a_wall_across_the_fibres_is_met_where_its_plane_is_crossed(rgb, twist):
     wall = truth.Rectangle((0.0, 0.0, c), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     p, v, _ = random_rays(count, 0, 1)
     p.z = dr.select(dr.abs(p.z - c) < 0.01, p.z + 0.02, p.z)
-    hit = intersect(rgb, truth.to_mitsuba([wall], rgb), p, v, twist, True, t_max)
+    hit = Traced(truth.to_mitsuba([wall], rgb), p, v, twist, True, t_max)
 
-    p, v, t = Array3f64(p), Array3f64(v), Float64(hit.distance)
+    p, v, t = Array3f64(p), Array3f64(v), hit.t
     column = dr.minimum(first_crossing(p, v, 0, Float64(0), t_max, twist),
                         first_crossing(p, v, 0, Float64(1), t_max, twist))
     below = dr.select(p.z > c, c, c - 1)

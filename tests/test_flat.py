@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from studio import (
+from benchmarks.studio import (
     film,
     gradient,
     place,

@@ -8,45 +8,23 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from studio import film, without_emitter_sampling, write_ply
-
-ALBEDO, EMISSION = 0.8, 0.5
+from benchmarks.studio import (
+    ALBEDO,
+    EMISSION,
+    ROUNDING,
+    cube_room,
+    glowing,
+    nil,
+    sensor,
+    write_ply,
+)
 
 # A ray's start is moved off its surface by Mitsuba's epsilon, 2e-4 here: where walls meet at an
 # acute angle, this may lead through the other wall, in `path` as well. A share of all vertices.
 ACUTE = 1e-4
 
-# Float32 sums of up to 20 terms.
-ROUNDING = 1e-5
-
-
-def nil(twist, quotient, max_depth, **more):
-    integrator = {"type": "nil", "twist": float(twist), "quotient": quotient,
-                  "max_depth": max_depth, "rr_depth": 100_000} | more
-    return without_emitter_sampling(mi.load_dict(integrator))
-
-
-def glowing(shape):
-    """The shape, white as chalk that glows: every path through it has the same radiance."""
-    return shape | {
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}},
-        "light": {"type": "area", "radiance": {"type": "rgb", "value": EMISSION}},
-    }
-
-
-def sensor(origin, target, size=32, **more):
-    return {"type": "perspective", "fov": 80,
-            "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1]),
-            "film": film(size, size, **more)}
-
-
-def cube_room():
-    return {"room": glowing({"type": "cube", "flip_normals": True})}
-
-
 def sphere_room():
     return {"room": glowing({"type": "sphere", "flip_normals": True})}
-
 
 def six_walls():
     T = mi.ScalarTransform4f
@@ -54,7 +32,6 @@ def six_walls():
     turns += [T().rotate(axis, angle) for axis in ([1, 0, 0], [0, 1, 0]) for angle in (90, -90)]
     return {f"wall{i}": glowing({"type": "rectangle", "to_world": turn @ T().translate([0, 0, -1])})
             for i, turn in enumerate(turns)}
-
 
 def furnished_room():
     """A room with things in it that glow as its walls do."""
@@ -65,7 +42,6 @@ def furnished_room():
                         "to_world": T().translate([0, -0.6, -0.7]).rotate([0, 0, 1], 20)
                         .scale(0.25)}),
     }
-
 
 class Walls:
     """One mesh of quadrangles that all glow towards the room.
@@ -92,10 +68,8 @@ class Walls:
         file = write_ply(folder / "walls.ply", self.vertices, self.triangles)
         return {"walls": glowing({"type": "ply", "filename": file, "face_normals": True})}
 
-
 # The two ends of an axis: what goes beyond the cube does not exist, and leaves no crack at it.
 ENDS = ((-0.1, 0.48, -1), (0.52, 1.1, 1))
-
 
 def room_across_faces(twist, folder):
     """A room around the cell's faces, edges and corner, between walls in the cell's middle.
@@ -122,7 +96,6 @@ def room_across_faces(twist, folder):
                 walls.add((0, 0, side), at(u0, v0), at(u1, v0), at(u1, v1), at(u0, v1))
     return walls.save(folder)
 
-
 def room_across_y_and_z(_twist, folder):
     """A room around the faces y and z, with walls before the faces x."""
     walls = Walls()
@@ -136,7 +109,6 @@ def room_across_y_and_z(_twist, folder):
     ball = glowing({"type": "sphere", "center": [0.4, 0.2, 0.8], "radius": 0.15})
     return {"ball": ball, **walls.save(folder)}
 
-
 def check_room(scene, integrator, max_depth, spp, seed=0, leaks=0):
     """Each pixel has the exact value, but for at most ``leaks`` of them."""
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
@@ -144,7 +116,6 @@ def check_room(scene, integrator, max_depth, spp, seed=0, leaks=0):
     error = dr.abs(image.array / exact - 1)
     wrong = dr.count(error > ROUNDING)[0] // 3
     assert wrong <= leaks, f"{wrong} pixels are wrong, by up to {dr.max(error)[0]:.2g}"
-
 
 @pytest.mark.parametrize("room", [cube_room, sphere_room, six_walls, furnished_room])
 @pytest.mark.parametrize("twist", [0, 1, 3, -1])
@@ -154,13 +125,11 @@ def test_closed_room_of_plain_nil_has_the_radiance_of_a_geometric_series(rgb, ro
                           **room()})
     check_room(scene, nil(twist, False, 8), 8, spp=16)
 
-
 @pytest.mark.parametrize("max_depth", [1, 2, 20])
 def test_radiance_of_a_closed_room_follows_the_number_of_bounces(rgb, max_depth):
     scene = mi.load_dict({"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]),
                           **cube_room()})
     check_room(scene, nil(1, False, max_depth), max_depth, spp=4)
-
 
 @pytest.mark.parametrize("cell", [([0.0, 0.0, 0.0], 1.0), ([-3.0, 2.0, 1.0], 2.0)])
 def test_closed_room_does_not_depend_on_the_cell(rgb, cell):
@@ -170,7 +139,6 @@ def test_closed_room_does_not_depend_on_the_cell(rgb, cell):
                           **furnished_room()})
     check_room(scene, nil(1, False, 8, cell_origin=mi.ScalarPoint3f(*origin), cell_size=size), 8,
                spp=16)
-
 
 @pytest.mark.parametrize("room, twist", [
     *[(room_across_faces, twist) for twist in (0, 1, -1)],
@@ -184,7 +152,6 @@ def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(rgb,
     # 16 samples of 8 vertices in 1,024 pixels
     leaks = ACUTE * 131_000 if room is room_across_faces and twist else 0
     check_room(scene, nil(twist, True, 8), 8, spp=16, leaks=leaks)
-
 
 @pytest.mark.parametrize("twist", [0, 1, 2, 3])
 def test_glowing_things_under_an_equally_bright_sky_are_invisible(rgb, twist):
@@ -203,7 +170,6 @@ def test_glowing_things_under_an_equally_bright_sky_are_invisible(rgb, twist):
     image = mi.render(scene, integrator=nil(twist, True, 120), spp=16)
     error = dr.max(dr.abs(image.array / equilibrium - 1))[0]
     assert error <= 3 * ROUNDING
-
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist, quotient", [(1, False), (3, False), (1, True), (2, True)])
@@ -225,7 +191,6 @@ def test_hardly_a_ray_is_lost_at_ten_million_vertices(rgb, twist, quotient, tmp_
 
 
 # ------------------------------------------------------------------ white things under a white sky
-
 WHITE = {
     "diffuse": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
     "mirror": {"type": "conductor"},
@@ -235,7 +200,6 @@ WHITE = {
                  "a": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}},
     "nothing": {"type": "null"},
 }
-
 
 def white_scene(bsdf, quotient):
     things = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}}}
@@ -254,7 +218,6 @@ def white_scene(bsdf, quotient):
         }
     return mi.load_dict({"type": "scene", **things})
 
-
 @pytest.mark.parametrize("bsdf", WHITE)
 @pytest.mark.parametrize("twist, quotient", [(0, False), (1, False), (3, False), (1, True),
                                              (2, True)])
@@ -272,7 +235,6 @@ def test_white_things_vanish_under_a_white_sky(rgb, bsdf, twist, quotient):
     # In the quotient a path is free only after 12 cells without a hit, and one that goes straight
     # through things may meet them again for ever.
     assert dr.count(ended)[0] <= (0.3 if quotient else 0.001) * len(image.array)
-
 
 def test_sky_behind_the_horizon_is_seen_undimmed(rgb):
     """An empty quotient: each ray reaches ``max_distance`` and meets the sky there."""

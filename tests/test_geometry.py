@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-import reference_geometry as reference
+from benchmarks import reference_geometry as reference
 from nil_mitsuba import geometry
 
 ARRAYS = [dr.llvm.Array3f, dr.llvm.Array3f64, dr.scalar.Array3f, dr.scalar.Array3f64]

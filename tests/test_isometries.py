@@ -11,8 +11,8 @@ import mitsuba as mi
 import pytest
 from drjit.llvm import Array3f64
 
+from benchmarks.studio import ICOSAHEDRON, faces, film, write_ply
 from nil_mitsuba import geometry
-from studio import ICOSAHEDRON, faces, film, write_ply
 from ztest import Estimate, assert_same_expectation, z_scores
 
 

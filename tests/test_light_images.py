@@ -12,7 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from studio import film, gradient, texture, without_emitter_sampling, write_ply
+from benchmarks.light_truth import irradiance
+from benchmarks.studio import film, gradient, texture, without_emitter_sampling, write_ply
+from patches import FAR_PATCHES, REACH, independent, lights, point_light, surface
 from ztest import POOLED_Z, Estimate, assert_same_expectation, z_scores
 
 # Chords err within the tolerance, and not equally for both techniques: a sixteenth of the default
@@ -223,8 +225,6 @@ def test_directionalarea_is_dark_as_in_path(rgb):
 def test_rendered_patch_shows_the_irradiance_of_a_point_light(rgb, twist):
     """ρ/π · Σ I cos θ / |A| over the geodesics that arrive, to 0.2 %, on a white floor that a
     camera looks at from so near that its rays are straight."""
-    from test_lights import FAR_PATCHES, REACH, irradiance
-
     p, n, q = FAR_PATCHES[twist][0]
     pairs = [(p, n, q), (p, n, (0.4, 0.5, 0.8))]
     assert n == (0, 0, 1)
@@ -296,8 +296,6 @@ def test_area_light_that_touches_surfaces_leaves_a_finite_image(rgb, twist):
 
 def test_directions_along_the_fibre_and_past_the_cut_point_are_finite(rgb):
     """Receivers exactly below the light, nearer and further than 2π/|k|, and beside that fibre."""
-    from test_lights import independent, lights, point_light, surface
-
     rows = [(dx, z) for dx in (0, 1e-20, 1e-9, 1e-7, 1e-5, 1e-3)
             for z in (0, 1e-20, 1e-6, 1, 2 * math.pi - 1e-6, 2 * math.pi, 2 * math.pi + 1e-6, 7,
                       4 * math.pi, 13, 20, 100)]
@@ -315,8 +313,6 @@ def test_directions_along_the_fibre_and_past_the_cut_point_are_finite(rgb):
 
 def test_area_light_on_its_own_fibre_is_finite(rgb):
     """A light 2π/|k| above a small floor: half turns near π."""
-    from test_lights import independent, lights, surface
-
     T = mi.ScalarTransform4f()
     count = 2**18
     for height in (2 * math.pi, 6.2, 6.4, 9):

@@ -12,135 +12,35 @@ import random
 import drjit as dr
 import mitsuba as mi
 import pytest
-from drjit.llvm import Array3f64, Bool, Float64, UInt32
+from drjit.llvm import Array3f64, Bool, Float64
 
-import reference_geometry as reference
-import truth
+from benchmarks import reference_geometry as reference
+from benchmarks import truth
+from benchmarks.light_truth import (
+    columns,
+    enough_cells,
+    geodesics,
+    images_within,
+    irradiance,
+    sum_over_images,
+)
+from patches import (
+    FAR_PATCHES,
+    REACH,
+    TILTED,
+    UP,
+    Strata,
+    independent,
+    lights,
+    point_light,
+    received,
+    surface,
+)
 
 POOLED_Z = 3.5  # one in 2,100 sound estimates is further off
 
 
-# ------------------------------------------------------------------ geodesics, independently
-
-
-def geodesics(p, q, twist, half_turns):
-    """Every geodesic from p to q (triples) with a half turn |v| < ``half_turns``, by scanning.
-
-    A geodesic with half turn v has the horizontal chord r = c T sin v / v and the symmetric height
-    ζ/k with 2v + R² (v − sin v cos v)/sin² v = ζ, R = k r/2; times sin² v this has no poles.
-    Returns a list of (direction, distance, half turn) and raises if a root is nearly double.
-    """
-    (px, py, pz), (qx, qy, qz), k = p, q, twist
-    dx, dy = qx - px, qy - py
-    height = qz - pz - k * px * dy - 0.5 * k * dx * dy
-    r = math.hypot(dx, dy)
-    zeta, R2 = k * height, (0.5 * k * r) ** 2
-    orientation = -1 if zeta < 0 else 1
-
-    def excess(v):
-        s, c = math.sin(v), math.cos(v)
-        return (2 * v - abs(zeta)) * s * s + R2 * (v - s * c)
-
-    steps = 2000 * math.ceil(half_turns / math.pi)
-    grid = [max(i / steps * half_turns, 1e-9) for i in range(steps + 1)]
-    values = [excess(v) for v in grid]
-    found = []
-    for a, b, fa, fb in zip(grid, grid[1:], values, values[1:]):
-        if (fa < 0) == (fb < 0):
-            continue
-        for _ in range(60):
-            m = 0.5 * (a + b)
-            if (excess(m) < 0) == (fa < 0):
-                a = m
-            else:
-                b = m
-        v = 0.5 * (a + b)
-        horizontal = r * v / math.sin(v)  # negative where the arc has turned past its start
-        distance = math.hypot(horizontal, 2 * v / k)
-        azimuth = math.atan2(dy, dx) - orientation * v
-        c = horizontal / distance
-        w = orientation * 2 * v / k / distance
-        found.append(((c * math.cos(azimuth), c * math.sin(azimuth), w), distance, v))
-    return found
-
-
-def irradiance(p, n, q, twist, reach):
-    """Σ cos θ / |A| over the geodesics from p (unit conormal n) to a light q of intensity 1."""
-    total = 0.0
-    for direction, distance, _ in geodesics(p, q, twist, 0.5 * abs(twist) * reach):
-        end, _ = reference.flow(p, direction, distance, twist)
-        assert reference.difference(end, q) < 1e-9, "the scan has found no geodesic"
-        cosine = sum(a * b for a, b in zip(direction, n))
-        if distance <= reach and cosine > 0:
-            density = abs(float(reference.area_density(distance, direction[2], twist)))
-            # A caustic would make the comparison one of rounding errors.
-            assert density > 0.02 * distance**2, f"{p}, {q} lie near a caustic"
-            total += cosine / density
-    return total
-
-
-# ------------------------------------------------------------------ lights, by the package
-
-
-def lights(twist, quotient, max_distance, **scene):
-    from nil_mitsuba.lights import Lights
-    from nil_mitsuba.quotient import Space
-
-    scene = mi.load_dict({"type": "scene", **scene})
-    return Lights(scene, Space(float(twist), quotient, [0, 0, 0], 1.0), max_distance)
-
-
-class Strata:
-    """A sampler whose number pairs run through equal steps, so that means are quadratures."""
-
-    def __init__(self, count, copies=1):
-        self.u = (mi.Float(dr.arange(mi.UInt32, count * copies) % count) + 0.5) / count
-
-    def next_1d(self):
-        return mi.Float(0.5)
-
-    def next_2d(self):
-        return mi.Point2f(self.u, 0.5)
-
-
-def independent(count, seed=0):
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, count)
-    return sampler
-
-
-def surface(points, normals):
-    """Surface interactions at points (scene) with unit frame normals."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
-    si.p, si.n = mi.Point3f(points), mi.Normal3f(normals)
-    si.sh_frame = mi.Frame3f(si.n)
-    si.t = 1.0
-    return si
-
-
-def columns(triples, repeat, vector_t=None):
-    """Triples as a Dr.Jit vector, each repeated."""
-    vector_t = vector_t or mi.Point3f
-    value_t = dr.value_t(vector_t)
-    index = dr.arange(UInt32, len(triples) * repeat) // repeat
-    return vector_t(*(dr.gather(value_t, value_t([float(t[i]) for t in triples]), index)
-                      for i in range(3)))
-
-
-def received(found, n):
-    """Irradiance that each light sample brings to a surface with unit normal n (first channel)."""
-    return found.weight[0] * dr.maximum(dr.dot(n, found.direction), 0)
-
-
-def point_light(position, intensity=1.0):
-    return {"type": "point", "position": list(position),
-            "intensity": {"type": "rgb", "value": intensity}}
-
-
 # ------------------------------------------------------------------ one light, one patch
-
-UP = (0.0, 0.0, 1.0)
-TILTED = (0.36, -0.48, 0.8)
 
 # (patch, its normal, light): what is joined is near, far, nearly vertical, nearly horizontal.
 PATCHES = [
@@ -152,18 +52,6 @@ PATCHES = [
     ((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (-2.5, 0.0, 0.002)),
     ((1.2, -0.7, -0.3), UP, (2.9, 0.5, 2.6)),
 ]
-
-# Beyond length 2π/|k|, and away from caustics: several geodesics arrive.
-FAR_PATCHES = {
-    1: [((0.0, 0.0, 0.0), UP, (0.5, -0.3, 8.925)), ((0.0, 0.0, 0.0), TILTED, (-0.7, 0.5, 15.0)),
-        ((0.4, -0.3, 0.5), (0.0, 0.0, -1.0), (1.1, 0.2, -20.0)),
-        ((0.0, 0.0, 0.0), (-0.6, 0.0, 0.8), (1.5, -0.4, 27.0))],
-    2: [((0.0, 0.0, 0.0), UP, (0.2, 0.1, 4.96)), ((0.0, 0.0, 0.0), TILTED, (-0.5, 0.4, -9.0))],
-    3: [((0.1, 0.2, 0.0), UP, (0.5, -0.3, 5.0)), ((0.0, 0.0, 0.0), TILTED, (-0.3, 0.4, 8.0))],
-    -1: [((0.1, 0.2, 0.0), UP, (1.0, 1.0, 10.0)),
-         ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (1.5, -0.4, -20.0))],
-}
-REACH = {1: 32.0, 2: 15.0, 3: 12.0, -1: 32.0}
 
 
 @pytest.mark.parametrize("twist", [1, 2, 3, -1])
@@ -180,7 +68,6 @@ def test_irradiance_is_the_cosine_over_area_density(rgb, twist):
         tried += expected > 0
     assert tried >= 2
 
-
 @pytest.mark.parametrize("twist", [1, 2, 3, -1])
 def test_irradiance_is_summed_over_every_geodesic_that_joins_patch_and_light(rgb, twist):
     """Several geodesics: Σ I cos θ / |A| to 0.2 % (quadrature over the choice among them)."""
@@ -195,12 +82,10 @@ def test_irradiance_is_summed_over_every_geodesic_that_joins_patch_and_light(rgb
         assert mean == pytest.approx(expected, rel=2e-3, abs=1e-9), (p, q)
     assert several >= len(FAR_PATCHES[twist])
 
-
 def test_light_behind_a_patch_brings_nothing(rgb):
     found = lights(1, False, 6.0, lamp=point_light((0.2, 0.1, -1))).sample(
         surface(mi.Point3f(0), mi.Normal3f(*UP)), Strata(1), mi.Bool(True))
     assert received(found, mi.Normal3f(*UP))[0] == 0
-
 
 def test_scene_units_measure_the_intensity(rgb):
     """A cell twice as large at another place: irradiance falls to a quarter, directions stay."""
@@ -223,7 +108,6 @@ def test_scene_units_measure_the_intensity(rgb):
 
 
 # ------------------------------------------------------------------ further geodesics
-
 
 @pytest.mark.parametrize("twist", [1, 2, 3, -1])
 def test_further_geodesics_are_those_of_the_scan(rgb, twist):
@@ -277,102 +161,8 @@ def test_further_geodesics_are_those_of_the_scan(rgb, twist):
 
 # ------------------------------------------------------------------ images
 
-
-def enough_cells(p, q, twist, reach):
-    """All (g, image of q) within the horizontal distance and the height that ``reach`` allows."""
-    k, images = abs(twist), []
-    height = reach * (1 + 0.16 * k * reach)
-    for gx in range(math.floor(p[0] - q[0] - reach), math.ceil(p[0] - q[0] + reach) + 1):
-        for gy in range(math.floor(p[1] - q[1] - reach), math.ceil(p[1] - q[1] + reach) + 1):
-            dx, dy = gx + q[0] - p[0], gy + q[1] - p[1]
-            if dx * dx + dy * dy > reach**2:
-                continue
-            rise = q[2] + twist * gx * q[1] - p[2] - twist * p[0] * dy - 0.5 * twist * dx * dy
-            for gz in range(math.ceil(-height - rise), math.floor(height - rise) + 1):
-                images.append((gx, gy, gz))
-    return images
-
-
-def images_within(p, q, twist, reach):
-    """Deck elements and positions (float64) of the images of q within the distance ``reach``."""
-    from nil_mitsuba import geometry
-
-    cells = enough_cells(p, q, twist, reach)
-    g = columns(cells, 1, Array3f64)
-    image = truth.multiply(g, Array3f64(*q), twist)
-    near = geometry.connect(Array3f64(*p), image, twist).distance <= reach
-    keep = dr.compress(near)
-    return dr.gather(Array3f64, g, keep), dr.gather(Array3f64, image, keep)
-
-
-def all_geodesics(p, q, twist, reach):
-    """Index, direction and distance of every geodesic within ``reach`` from p to points q, in
-    float64 by a scan of 1,000 steps per π of the half turn. Twist 0: the straight lines."""
-    p = Array3f64(*p)
-    count = dr.width(q)
-    if twist == 0:
-        d = q - p
-        distance = dr.norm(d)
-        return dr.arange(UInt32, count), d / distance, distance
-
-    def terms(index):
-        at = dr.gather(Array3f64, q, index)
-        dx, dy = at.x - p.x, at.y - p.y
-        height = at.z - p.z - twist * p.x * dy - 0.5 * twist * dx * dy
-        return dr.atan2(dy, dx), dr.hypot(dx, dy), twist * height
-
-    def excess(v, r, zeta):
-        s, c = dr.sincos(v)
-        return (2 * v - zeta) * s * s + dr.square(0.5 * twist * r) * (v - s * c)
-
-    half_turns = 0.5 * abs(twist) * reach
-    steps = math.ceil(1000 * half_turns / math.pi)
-    lane = dr.arange(dr.llvm.UInt64, count * steps)
-    index, v = UInt32(lane // steps), Float64(lane % steps) / steps * half_turns
-    _, r, zeta = terms(index)
-    zeta = dr.abs(zeta)
-    b = v + half_turns / steps
-    # v = 0 itself is no root: the excess starts with −ζ v² there
-    crossing = (excess(dr.maximum(v, 1e-9), r, zeta) < 0) != (excess(b, r, zeta) < 0)
-    keep = dr.compress(crossing)
-    index, a, b = dr.gather(UInt32, index, keep), dr.gather(Float64, v, keep), \
-        dr.gather(Float64, b, keep)
-    a = dr.maximum(a, 1e-9)
-    azimuth, r, zeta = terms(index)
-    orientation = dr.select(zeta < 0, Float64(-1), 1)
-    zeta = dr.abs(zeta)
-    low = excess(a, r, zeta) < 0
-    for _ in range(45):
-        m = 0.5 * (a + b)
-        same = (excess(m, r, zeta) < 0) == low
-        a, b = dr.select(same, m, a), dr.select(same, b, m)
-        dr.eval(a, b)
-    v = 0.5 * (a + b)
-    horizontal = r * v / dr.sin(v)
-    distance = dr.hypot(horizontal, 2 * v / abs(twist))
-    angle = azimuth - orientation * v
-    c = horizontal / distance
-    direction = Array3f64(c * dr.cos(angle), c * dr.sin(angle),
-                          orientation * 2 * v / (twist * distance))
-    keep = dr.compress(distance <= reach)
-    return (dr.gather(UInt32, index, keep), dr.gather(Array3f64, direction, keep),
-            dr.gather(Float64, distance, keep))
-
-
-def sum_over_images(p, n, q, twist, reach):
-    """Σ cos θ / |A| over all images of q within ``reach`` and all geodesics to each, in float64."""
-    from nil_mitsuba import geometry
-
-    _, images = images_within(p, q, twist, reach)
-    _, direction, distance = all_geodesics(p, images, twist, reach)
-    density = dr.abs(geometry.area_density(distance, direction.z, float(twist)))
-    cosine = dr.maximum(dr.dot(direction, Array3f64(*n)), 0)
-    return dr.sum(cosine / density)[0], dr.width(distance)
-
-
 CELL_PAIRS = [((0.31, 0.42, 0.17), UP, (0.62, 0.55, 0.71)),
               ((0.05, 0.93, 0.52), TILTED, (0.97, 0.11, 0.13))]
-
 
 @pytest.mark.parametrize("twist, reach", [(0, 5.0), (0, 12.0), (1, 5.0), (1, 12.0), (2, 3.0),
                                           (2, 8.0), (-1, 5.0)])
@@ -392,13 +182,11 @@ def test_light_in_the_quotient_is_the_sum_over_its_images(rgb, twist, reach, pai
     assert deviation < 0.01 * expected
     assert abs(mean - expected) <= POOLED_Z * deviation + 2e-5 * expected
 
-
 def chooser(twist, max_distance):
     from nil_mitsuba.lights import Images
     from nil_mitsuba.quotient import Space
 
     return Images(Space(float(twist), True, [0, 0, 0], 1.0), max_distance)
-
 
 @pytest.mark.parametrize("twist, max_distance", [(0, 5.0), (1, 5.0), (2, 5.0), (3, 3.0), (-1, 5.0),
                                                  (1, 12.0)])
@@ -411,7 +199,6 @@ def test_probabilities_of_all_images_add_up_to_one(rgb, twist, max_distance, pai
         mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(g)))
     assert dr.all(probability >= 0)
     assert dr.sum(Float64(probability))[0] == pytest.approx(1, abs=1e-4)
-
 
 @pytest.mark.parametrize("twist", [0, 1, 2, -1])
 @pytest.mark.parametrize("pair", range(len(CELL_PAIRS)))
@@ -454,7 +241,6 @@ def test_images_are_chosen_as_often_as_their_probability_says(rgb, twist, pair):
     again = images.probability(mi.Point3f(*p), mi.Point3f(*q), g)
     assert dr.all(dr.abs(again - told) <= 1e-5 * told)
 
-
 @pytest.mark.parametrize("twist, max_distance", [(0, 12.0), (1, 12.0), (2, 12.0), (-1, 5.0)])
 def test_every_image_within_the_distance_can_be_chosen(rgb, twist, max_distance):
     """Also for points on opposite faces of the cell."""
@@ -469,7 +255,6 @@ def test_every_image_within_the_distance_can_be_chosen(rgb, twist, max_distance)
 
 # ------------------------------------------------------------------ power and reciprocity
 
-
 def visible(scene, integrator, si, found):
     """Whether nothing stands between the points and the light drawn for them."""
     from nil_mitsuba.integrator import View
@@ -477,7 +262,6 @@ def visible(scene, integrator, si, found):
 
     active = mi.Bool(found.weight[0] > 0) & (dr.dot(si.n, found.direction) > 0)
     return active & integrator._visible(View(scene, integrator), si, found, Cone(0, 1e-4), active)
-
 
 @pytest.mark.parametrize("radius", [0.5, 4.0, pytest.param(9.0, marks=pytest.mark.verify)])
 @pytest.mark.parametrize("twist", [1, -1])
@@ -519,7 +303,6 @@ def test_closed_surface_receives_the_whole_power_of_a_light(rgb, radius, twist):
     assert deviation < 0.005 * 4 * math.pi
     assert abs(mean - 4 * math.pi) <= POOLED_Z * deviation + 2e-3 * 4 * math.pi
 
-
 @pytest.mark.parametrize("twist, quotient", [
     (1, False), (0, True), (1, True),
     *(pytest.param(k, q, marks=pytest.mark.verify) for k, q in ((3, False), (2, True)))])
@@ -543,7 +326,6 @@ def test_transport_is_the_same_when_light_and_detector_are_swapped(rgb, twist, q
     assert max(da, db) < 0.02 * a
     assert abs(a - b) <= POOLED_Z * math.hypot(da, db)
 
-
 def flux(scene, twist, quotient, seed):
     """Power that the shape "detector" receives through its front, and the standard deviation."""
     from nil_mitsuba import geometry
@@ -566,7 +348,6 @@ def flux(scene, twist, quotient, seed):
 
 
 # ------------------------------------------------------------------ shadows
-
 
 @pytest.mark.parametrize("twist, quotient", [(1, False), (2, False), (0, True), (1, True)])
 def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, quotient):
@@ -612,7 +393,6 @@ def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, qu
 
 # ------------------------------------------------------------------ refusals
 
-
 def test_emitter_without_a_meaning_is_refused_with_a_sentence(rgb):
     class Firefly(mi.Emitter):
         def __init__(self, props):
@@ -625,7 +405,6 @@ def test_emitter_without_a_meaning_is_refused_with_a_sentence(rgb):
     mi.register_emitter("firefly", lambda props: Firefly(props))
     with pytest.raises(RuntimeError, match="has no meaning for the emitter.*use area, point"):
         lights(1, True, 12.0, glow={"type": "firefly"})
-
 
 @pytest.mark.parametrize("emitter", ["point", "spot", "projector", "directional", "constant",
                                      "sunsky", "timed_sunsky"])

@@ -18,14 +18,16 @@ BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 # Programs that another test runs at a small size.
 TESTED_BY = {
-    "examples/accuracy_vs_speed.py": "test_chart.py",
+    "benchmarks.chart": "test_chart.py",
+    "benchmarks.reference_geometry": "test_geometry.py",
     "examples/render_from_python.py": "test_examples.py",
     "examples/walk.py": "test_examples.py",
     "examples/twist.py": "test_examples.py",
     "examples/light_images.py": "test_examples.py",
     "examples/own_mesh.py": "test_examples.py",
 }
-QUICK = ("examples/speed.py", "examples/emitter_sampling.py", "examples/stills.py")
+QUICK = ("benchmarks.camera_rays", "benchmarks.speed", "benchmarks.emitter_sampling",
+         "benchmarks.stills")
 
 
 def blocks(*languages):
@@ -43,7 +45,7 @@ def desk(tmp_path_factory):
     """A folder with the README's first scene and links to what its commands read."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(ROOT / "scenes", folder / "scenes")  # pictures are written beside scenes
-    for name in ("examples", "tests", "nil_mitsuba", "Makefile", "pyproject.toml",
+    for name in ("examples", "benchmarks", "tests", "nil_mitsuba", "Makefile", "pyproject.toml",
                  "README.md", "docs"):
         (folder / name).symlink_to(ROOT / name)
     (folder / "hello.xml").write_text(blocks("xml")[0])
@@ -96,13 +98,10 @@ def run_small(desk, line):
         run(desk, [*command, *words, *size, "--spp", "2"])
     elif program == "nil-mitsuba":
         run(desk, [*command, *words])
-    elif program == "python" and words[0] in TESTED_BY:
-        name = Path(words[0]).stem
-        assert name in (ROOT / "tests" / TESTED_BY[words[0]]).read_text(encoding="utf-8")
-    elif program == "python" and words[0].startswith("tests/"):
-        # Minutes long; the tests call what these print
-        assert '__name__ == "__main__"' in (ROOT / words[0]).read_text(encoding="utf-8")
-    elif program == "python" and words[0] in QUICK:
+    elif program == "python" and words[-1] in TESTED_BY:
+        name = Path(words[-1].removeprefix("benchmarks.")).stem
+        assert name in (ROOT / "tests" / TESTED_BY[words[-1]]).read_text(encoding="utf-8")
+    elif program == "python" and words[-1] in QUICK:
         run(desk, [sys.executable, *words, "--quick"])
     else:
         pytest.fail(f"no way to run {line!r} at a small size: add one")

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
+from benchmarks.studio import film, place
 from nil_mitsuba import geometry
-from studio import film, place
 from ztest import Estimate, assert_same_expectation
 
 PLAIN = {"type": "nil", "quotient": False, "twist": 1.0, "max_depth": 3}

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
+from benchmarks.studio import film, place, texture, write_ply
 from nil_mitsuba import geometry
-from studio import film, place, texture, write_ply
 
 
 def scene_of(thing):

@@ -662,12 +662,11 @@ def test_the_hash_of_a_scene_tells_what_it_shows(folder):
 
 def test_a_scene_made_in_python_has_the_same_hash_in_every_process(small, fresh_python):
     code = (
-        "import sys; sys.path.insert(0, 'tests')\n"
         "import nil_mitsuba, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"
         "import test_stills\nfrom nil_mitsuba import stills\n"
         "print(stills.hash_of_scene(mi.load_dict(test_stills.description())))"
     )
-    run = fresh_python(code)
+    run = fresh_python(code, PYTHONPATH="tests")
     assert run.stdout.strip() == stills.hash_of_scene(small), run.stderr
 
 

@@ -7,7 +7,7 @@ import mpmath
 import pytest
 from drjit.llvm import PCG32, Array3f64, Array3i, Float64, Int32, UInt32, UInt64
 
-import truth
+from benchmarks import truth
 
 
 def random_unit(rng):

@@ -13,9 +13,6 @@ import sys
 import tempfile
 import time
 
-import nil_mitsuba  # noqa: F401 - before mitsuba
-
-# isort: split
 import drjit as dr
 import mitsuba as mi
 

@@ -11,9 +11,6 @@ from __future__ import annotations
 import argparse
 import time
 
-import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.Jit will use
-
-# isort: split
 import drjit as dr
 import mitsuba as mi
 

@@ -14,9 +14,6 @@ import tempfile
 import time
 from statistics import NormalDist
 
-import nil_mitsuba  # noqa: F401 - before mitsuba and drjit: it chooses LLVM
-
-# isort: split
 import drjit as dr
 import mitsuba as mi
 
@@ -74,10 +71,11 @@ def against_path(width, spp, rounds):
 
 def first_render():
     """Seconds that a first render takes where no kernel was kept from earlier ones."""
-    code = ("import time, speed\nscene = speed.bent_box(64)\nstart = time.perf_counter()\n"
-            "speed.seconds(scene, 1, 0)\nprint(time.perf_counter() - start)")
+    code = ("import time\nfrom benchmarks import speed\nscene = speed.bent_box(64)\n"
+            "start = time.perf_counter()\nspeed.seconds(scene, 1, 0)\n"
+            "print(time.perf_counter() - start)")
     with tempfile.TemporaryDirectory() as home:  # Dr.Jit keeps its kernels below it
-        run = subprocess.run([sys.executable, "-c", code], cwd=pathlib.Path(__file__).parent,
+        run = subprocess.run([sys.executable, "-c", code], cwd=pathlib.Path(__file__).parents[1],
                              env=os.environ | {"HOME": home}, capture_output=True, text=True,
                              check=True)
     print(f"first render, compilation included: {float(run.stdout):.1f} s")

@@ -1,47 +1,19 @@
-"""Prints where methods of tracing geodesics of Nil fail, and by how much: two Markdown tables.
-
-The first is about a geodesic alone. The formula is the closed form of VISGRAF TR-19-06, which
-divides by w; RK4 takes steps of 1/20 of a cell; the adaptive pair is that of Dormand and Prince
-with a tolerance of 1e-6. Errors are distances in cells from the true point, the largest of all
-rays, and in brackets the share of rays that are off by more than 1e-3. Crossings of faces are those
-of tests/face_crossing.py, which brackets the package's ``flow`` between its extrema.
-
-The second is about rays that look for surfaces; in brackets, the share of rays that name another
-one. The tracers are those of tests/test_failures_tracing.py: chords of 1/20 of a cell by the
-printed formula and by RK4, the adaptive pair with a tolerance of 1e-4 for its chords, and the
-package at its default tolerance.
-
-All are in float32; the truth is computed in float64 by code of its own (tests/truth.py). Twist 1
-unless a row says otherwise. Takes about five minutes of two cores.
-"""
+"""Prints where methods of tracing geodesics of Nil fail, and by how much: two Markdown tables."""
 
 import argparse
 import math
-import sys
 import tempfile
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / part) for part in ("", "tests")]
+import drjit as dr
+import mitsuba as mi
+from drjit.llvm import Array3f, Array3f64, Float64
 
-import nil_mitsuba  # noqa: E402, F401 - before mitsuba and drjit: it chooses LLVM
-
-# isort: split
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-from drjit.llvm import Array3f, Array3f64, Float64  # noqa: E402
-
-mi.set_variant("llvm_ad_rgb")
-mi.set_log_level(mi.LogLevel.Error)  # sheared cylinders are meant
-
-import report_formulas  # noqa: E402
-import test_failures_geodesics as geodesics  # noqa: E402
-import test_failures_tracing as tracing  # noqa: E402
-import test_tracer  # noqa: E402
-import tracing_methods  # noqa: E402
-import truth  # noqa: E402
-from test_failures_faces import (  # noqa: E402
+from .. import camera_rays, report_formulas, truth
+from ..tracers import KNOBS, TRACERS, Traced
+from . import geodesics, tracing
+from .crossings import (
     FURTHER,
-    KNOBS,
     crossings_ahead,
     crossings_just_reached,
     first_crossing,
@@ -53,7 +25,7 @@ METHODS = {"report's formula": geodesics.report,
            "Runge–Kutta 4, step 0.05": geodesics.runge_kutta,
            "Dormand–Prince, 1e-6": geodesics.dormand_prince,
            "package": geodesics.package}
-TRACERS = {"printed form, chords 0.05": "printed form",
+COLUMNS = {"printed form, chords 0.05": "printed form",
            "Runge–Kutta 4, chords 0.05": "Runge–Kutta 4",
            "Dormand–Prince, 1e-4": "Dormand–Prince",
            "package": "package"}
@@ -163,26 +135,25 @@ def tangents(sizes):
 
 def by_each(measure):
     """A row: what ``measure`` says of each tracer, given its name and what makes it."""
-    return [measure(name, tracing.TRACERS[name]) for name in TRACERS.values()]
+    return [measure(name, TRACERS[name]) for name in COLUMNS.values()]
 
 
 def faces(sizes):
-    if sizes.quick:
-        tracing.COUNT = 100
+    each = sizes.rays(tracing.COUNT)
     kinds = {
         "through edges and corners": ["corner", *(f"edge along {axis}" for axis in "xyz")],
         "tangent to a face": [f"tangent to face {axis}" for axis in "xyz"],
         "starting on a face": [f"starting on face {axis}" for axis in "xyz"],
     }
     for kind, names in kinds.items():
-        p, v = tracing.aimed_rays(names, 1)
-        count = tracing.COUNT * len(names)
+        p, v = tracing.aimed_rays(names, 1, each)
+        count = each * len(names)
         yield (f"{kind}: name another surface, of {count:,} rays",
                by_each(lambda _, make: share(dr.count(tracing.naming(
                    truth.cell_scene(), p, v, 1, True, make=make)[2])[0], count)))
-    yield (f"along a face: miss the wall ahead, of {3 * tracing.COUNT:,} rays",
-           by_each(lambda _, make: share(sum(tracing.walls_along_faces(axis, 1, make)[0]
-                                             for axis in range(3)), 3 * tracing.COUNT)))
+    yield (f"along a face: miss the wall ahead, of {3 * each:,} rays",
+           by_each(lambda _, make: share(sum(tracing.walls_along_faces(axis, 1, make, each)[0]
+                                             for axis in range(3)), 3 * each)))
 
 
 def off(error, wrong):
@@ -207,7 +178,7 @@ def walls(sizes):
         scenes.append((shapes, dr.minimum(*exact)))
 
     def passed(_, make):
-        return share(sum(rays_off(tracing.Traced(shapes, p, v, 1, False, FURTHER, make=make).t,
+        return share(sum(rays_off(Traced(shapes, p, v, 1, False, FURTHER, make=make).t,
                                   exact) for shapes, exact in scenes), 3 * count)
 
     yield f"walls at the faces: met 1e-3 off or not at all, of {3 * count:,} rays", by_each(passed)
@@ -217,7 +188,7 @@ def long_ways(sizes):
     for t in sizes.lengths((20, 100, 500)):
         def walk(name, _):
             walked = (geodesics.walked if name == "package" else
-                      geodesics.stepped(tracing_methods.METHODS[name], KNOBS[name]))
+                      geodesics.stepped(name, KNOBS[name]))
             errors = geodesics.walk_errors(t, 1, sizes.rays(4000), walked)
             return " / ".join(number(dr.max(error)[0]) for error in errors)
 
@@ -256,7 +227,7 @@ def thin_things(sizes):
             lambda _, make: share(*tracing.needles_passed(Path(folder), 1, make, 10,
                                                           sizes.rays(50_000))))
     width = 32 if sizes.quick else 512
-    found = by_each(lambda _, make: test_tracer.compare(mi, "quotient", 1, 0.25, width, make)[:2])
+    found = by_each(lambda _, make: camera_rays.compare(mi, "quotient", 1, 0.25, width, make)[:2])
     for i, where in enumerate(("away from silhouettes", "within a pixel of silhouettes")):
         yield f"camera rays {where}: name another surface", [share(row[i]) for row in found]
 
@@ -310,9 +281,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few rays, to see that it runs")
     sizes = Sizes(parser.parse_args().quick)
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)  # sheared cylinders are meant
     print_table(METHODS, (directions, lengths, places_and_twists, crossings, tangents), sizes)
     print()
-    print_table(TRACERS, (faces, walls, long_ways, places_and_sizes, thin_things, contacts,
+    print_table(COLUMNS, (faces, walls, long_ways, places_and_sizes, thin_things, contacts,
                           mirrors_and_glass, connections), sizes)
 
 

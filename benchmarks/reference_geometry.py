@@ -1,6 +1,7 @@
 """Truth for the geometry of Nil that shares no code with the package: mpmath and an ODE.
 
-Run as a script, it prints the worst errors of ``nil_mitsuba.geometry`` beside their limits.
+``python -m benchmarks.reference_geometry`` prints the worst errors of ``nil_mitsuba.geometry``
+beside their limits.
 """
 
 import random
@@ -8,9 +9,6 @@ from functools import cache
 from itertools import product
 from math import hypot, inf, pi, sqrt
 
-import nil_mitsuba  # noqa: F401 - before drjit: it chooses LLVM
-
-# isort: split
 import drjit as dr
 from mpmath import mp, mpf
 
@@ -390,8 +388,4 @@ def main():
 
 
 if __name__ == "__main__":
-    import sys
-    from pathlib import Path
-
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
     main()

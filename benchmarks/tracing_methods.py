@@ -3,7 +3,7 @@
 All of them cut the geodesic into chords, search each chord for a surface with Embree, and carry
 chords through the glued faces of the cube as the package does; they have its ``intersect`` and
 ``occluded``. They differ in how the next point of the geodesic is found and how far it is away.
-They exist for the chart (``accuracy_vs_speed.py``) and the table of failures (``failures.py``).
+They exist for the chart (``chart``) and the tables of failures (``failures``).
 Points are in cells and directions in frame components. Set a Mitsuba variant before this module
 is imported.
 """
@@ -13,10 +13,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-import report_formulas
 from nil_mitsuba import geometry
 from nil_mitsuba.quotient import through_face
 from nil_mitsuba.tracer import Hit, Tracer, line_ray
+
+from . import report_formulas
 
 
 class Euler:
@@ -231,7 +232,7 @@ class ChordTracer(Tracer):
         """First hit of the geodesic from ``p`` in frame direction ``v`` within ``reach``."""
         return self._follow(p, v, p, reach, active, time, False)
 
-    def occluded(self, p, start, v, cone, reach, active, time=0, far=True):
+    def occluded(self, p, start, v, cone, reach, active, time=0):
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach``.
 
         The first chord begins at ``start``, off the surface on which ``p`` lies. Nothing is

@@ -1,4 +1,4 @@
-"""End points of geodesics by heyoka, a Taylor integrator, as a peer for ``accuracy_vs_speed.py``.
+"""End points of geodesics by heyoka, a Taylor integrator, as a peer for the chart.
 
 heyoka brings numpy and an LLVM of its own, so it runs in a process of its own, and it is optional.
 Reads {"starts": [[x, y, z, a, b, w], …], "length", "tolerance"} from the standard input, and

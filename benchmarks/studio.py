@@ -107,3 +107,36 @@ def without_emitter_sampling(integrator):
     """The integrator, told to find lights by BSDF sampling alone."""
     integrator.emitter_sampling = False
     return integrator
+
+
+# ---------------------------------------------------------------------------
+#  Furnaces
+# ---------------------------------------------------------------------------
+
+ALBEDO, EMISSION = 0.8, 0.5
+# Float32 sums of up to 20 terms.
+ROUNDING = 1e-5
+
+
+def nil(twist, quotient, max_depth, **more):
+    integrator = {"type": "nil", "twist": float(twist), "quotient": quotient,
+                  "max_depth": max_depth, "rr_depth": 100_000} | more
+    return without_emitter_sampling(mi.load_dict(integrator))
+
+
+def glowing(shape):
+    """The shape, white as chalk that glows: every path through it has the same radiance."""
+    return shape | {
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}},
+        "light": {"type": "area", "radiance": {"type": "rgb", "value": EMISSION}},
+    }
+
+
+def sensor(origin, target, size=32, **more):
+    return {"type": "perspective", "fov": 80,
+            "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1]),
+            "film": film(size, size, **more)}
+
+
+def cube_room():
+    return {"room": glowing({"type": "cube", "flip_normals": True})}
