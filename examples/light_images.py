@@ -44,7 +44,7 @@ def images(p, q, twist, length):
 def shortest(p, q, twist, length):
     """Lengths up to ``length``, directions and area densities of the shortest geodesics."""
     way = geometry.connect(p, images(p, q, twist, length), twist)
-    return taken(way.direction, way.distance, way.area_density, length)
+    return taken(way, length)
 
 
 def further(p, q, twist, length):
@@ -53,16 +53,16 @@ def further(p, q, twist, length):
     found = []
     for m in range(1, int(length * twist / (2 * math.pi)) + 1):
         for second in (False, True):
-            direction, _, distance, density = further_geodesic(
-                p, there, mi.Float(twist), mi.Float(m), mi.Bool(second))
-            found += taken(direction, distance, density, length)
+            exists, way = further_geodesic(p, there, mi.Float(twist), mi.Float(m), mi.Bool(second))
+            found += taken(way, length, exists)
     return found
 
 
-def taken(direction, distance, density, length):
-    index = dr.compress(distance <= length)
-    direction = dr.gather(mi.Vector3f, mi.Vector3f(direction), index)
-    distance, density = (dr.gather(mi.Float, mi.Float(x), index) for x in (distance, density))
+def taken(way, length, exists=True):
+    index = dr.compress(exists & (way.distance <= length))
+    direction = dr.gather(mi.Vector3f, mi.Vector3f(way.direction), index)
+    distance, density = (dr.gather(mi.Float, mi.Float(x), index)
+                         for x in (way.distance, way.area_density))
     return list(zip(distance, direction.x, direction.y, direction.z, dr.abs(density)))
 
 

@@ -189,7 +189,7 @@ class Lights:
     def __init__(self, scene: mi.Scene, space: Space, max_distance: float):
         self.scene = scene
         self.space = space
-        self.max_distance = max_distance
+        self.max_distance = dr.opaque(mi.Float, max_distance)
         emitters = scene.emitters()
         names = [emitter.class_name() for emitter in emitters]
         for emitter, name in zip(emitters, names):
@@ -212,6 +212,9 @@ class Lights:
         self.uniform = all(weight == weights[0] for weight in weights)
         self.pmf = 1 / len(emitters) if self.uniform and emitters else 0
         self.weight_scale = 1 / sum(weights) if weights and not self.uniform else 0
+        # All that is not minimising has half turns beyond π: arcs longer than 2π/|k|
+        self.has_further = space.twist_number != 0 and \
+            abs(space.twist_number) * max_distance > 2 * math.pi
         if self.has_point:
             self.positions = self._point_positions(emitters, names)
         self.images = Images(space, max_distance) if space.quotient else None
@@ -318,22 +321,16 @@ class Lights:
         space = self.space
         image, probability = self._image_of(p, q, u1, u2)
         way = geometry.connect(p, image, space.twist)
-        direction, arrival = mi.Vector3f(way.direction), mi.Vector3f(way.arrival)
-        distance, density = mi.Float(way.distance), mi.Float(way.area_density)
-        turns = abs(space.twist_number) * self.max_distance / (2 * math.pi)
-        if turns >= 1:
+        if self.has_further:
             # Half of the samples go to the minimising geodesic where there may be others.
-            zeta = dr.abs(space.twist) * dr.abs(_symmetric_height(p, image, space.twist))
-            count = dr.minimum(dr.floor(zeta / (2 * dr.pi)), min(turns, 2**24))
+            count = further_intervals(p, image, space.twist, self.max_distance)
             further = (count > 0) & (u >= 0.5)
             v = dr.select(further, 2 * u - 1, 0) * count
             m = dr.minimum(dr.floor(v), count - 1) + 1
             second = (v - dr.floor(v)) >= 0.5
-            other = further_geodesic(p, image, space.twist, m, second)
-            direction = dr.select(further, other[0], direction)
-            arrival = dr.select(further, other[1], arrival)
-            distance = dr.select(further, other[2], distance)
-            density = dr.select(further, other[3], density)
+            exists, other = further_geodesic(p, image, space.twist, m, second)
+            way = dr.select(further, other, way)
+            active &= ~further | exists
             probability *= dr.select(further, 0.25 / dr.maximum(count, 1),
                                      dr.select(count > 0, 0.5, 1))
 
@@ -341,13 +338,13 @@ class Lights:
         # there is its intensity.
         reference = dr.zeros(mi.Interaction3f)
         light = emitter.sample_direction(reference, mi.Point2f(0.5), active)[0].p
-        reference.p = light - arrival
+        reference.p = light - mi.Vector3f(way.arrival)
         reference.wavelengths, reference.time = si.wavelengths, si.time
         ds, intensity = emitter.sample_direction(reference, mi.Point2f(0.5), active)
-        density = dr.abs(density) * dr.square(space.size)
-        reached = active & (density > 0) & (distance <= self.max_distance) & (ds.pdf > 0)
+        density = dr.abs(way.area_density) * dr.square(space.size)
+        reached = active & (density > 0) & (way.distance <= self.max_distance) & (ds.pdf > 0)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(direction, distance, weight, mi.Float(0), mi.Bool(True), mi.Float(0))
+        return LightSample(mi.Vector3f(way.direction), mi.Float(way.distance), weight, mi.Float(0), mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
 
@@ -411,20 +408,52 @@ def _symmetric_height(p, q, twist):
     return q.z - p.z - 0.5 * twist * (p.x + q.x) * (q.y - p.y)
 
 
+def _relative(p, q, twist):
+    """Horizontal displacement of q from p, ζ with the sign of its height, and R² as in `connect`.
+
+    R stays clear of 0, where each further geodesic is a circle of them: at 1e-6 it moves none that
+    float32 tells from its fibre.
+    """
+    dx, dy = q.x - p.x, q.y - p.y
+    zeta = twist * _symmetric_height(p, q, twist)
+    return dx, dy, zeta, dr.maximum(0.25 * dr.square(twist) * dr.fma(dx, dx, dy * dy), 1e-12)
+
+
+def further_intervals(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, max_distance: mi.Float
+                      ) -> mi.Float:
+    """How many of the intervals (mπ, (m+1)π), m ≥ 1, may hold half turns of geodesics to q.
+
+    They are the first ones, as 2v + R² μ(v) = ζ has there, with v = mπ + x and c = cot x, the left
+    side 2v + R² (v + v c² − c). That is at least (2 + R²) v − R²/4v, and, as its minimum has c > 0
+    and x ≥ π/2 − c, at least (2 + R²)(mπ + π/2) − (1 + R²)²/(R² mπ). The first bound is close for
+    small R, the second for large R; solved for mπ, they leave at most one interval without any.
+    """
+    _, _, zeta, R2 = _relative(p, q, twist)
+    zeta = dr.abs(zeta)
+    slope = 2 + R2
+    small = zeta + dr.sqrt(dr.fma(zeta, zeta, slope * R2))
+    excess = dr.fma(-0.5 * dr.pi, slope, zeta)
+    large = excess + dr.sqrt(dr.fma(excess, excess, 4 * slope * dr.square(1 + R2) / R2))
+    most = dr.minimum(small, large) / (2 * slope)
+    # An arc is longer than 2v √(1 + R²)/|k|
+    most = dr.minimum(most, 0.5 * dr.abs(twist) * max_distance * dr.rsqrt(1 + R2))
+    # Beyond 2²⁴ a float32 counts no more
+    return dr.minimum(dr.floor(most / dr.pi), 2**24)
+
+
 def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float, second: mi.Bool
-                     ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Float]:
+                     ) -> tuple[mi.Bool, geometry.Connection]:
     """The first or ``second`` geodesic from p to q (cells) whose half turn is in (mπ, (m+1)π).
 
-    There 2v + R² μ(v) is convex with poles at both ends, so it meets ζ twice or not at all.
-    Returns direction, arrival, distance and signed area density; distance is infinite if there is
-    none. The minimum and the root are bisected in the sign of smooth functions.
+    Returns whether there is one, and it; its area density is signed. 2v + R² μ(v) is convex there,
+    with poles at both ends, so it meets ζ twice or not at all. The minimum and the root are
+    bisected in the sign of smooth functions.
     """
     k = dr.abs(twist)
-    dx, dy = q.x - p.x, q.y - p.y
-    height = _symmetric_height(p, q, twist) * dr.sign(twist)
-    zeta = k * dr.abs(height)
-    r2 = dr.fma(dx, dx, dy * dy)
-    R2 = dr.maximum(0.25 * dr.square(k) * r2, 1e-12)
+    dx, dy, zeta, R2 = _relative(p, q, twist)
+    orientation = dr.select(zeta < 0, mi.Float(-1), 1)
+    zeta = dr.abs(zeta)
+    r = dr.sqrt(dr.fma(dx, dx, dy * dy))
     low = dr.pi * m
 
     def bisect(lower, upper, rises):
@@ -445,23 +474,21 @@ def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float,
         s, c = dr.sincos(x)
         return (2 * (low + x) - zeta) * dr.square(s) + R2 * (low + x - s * c)
 
-    exists = excess(x_min) < 0
+    exists = (excess(x_min) < 0) & (r > 0)
     x = bisect(dr.select(second, x_min, 0), dr.select(second, dr.pi, x_min),
                lambda x: dr.select(second, excess(x) > 0, excess(x) < 0))
     v = low + x
-    horizontal = dr.sqrt(r2) * v / dr.sin(x)
+    horizontal = r * v / dr.sin(x)
     vertical = 2 * v / k
     distance = dr.hypot(horizontal, vertical)
     a, w = horizontal / distance, vertical / distance
     # Displacement and direction differ by the half turn; an odd m turns round by π in addition.
-    up = dr.select(height < 0, -1, mi.Float(1)) * dr.sign(twist)
     odd = (m - 2 * dr.floor(0.5 * m)) > 0.5
     angle = dr.atan2(dy, dx) + dr.select(odd, dr.pi, 0)
-    turn = v * dr.select(height < 0, -1, mi.Float(1))
+    turn = v * orientation
     s0, c0 = dr.sincos(angle - turn)
     s1, c1 = dr.sincos(angle + turn)
-    w *= up
-    density = geometry.area_density(distance, w, twist)
-    found = exists & (r2 > 0)
-    return (mi.Vector3f(a * c0, a * s0, w), mi.Vector3f(a * c1, a * s1, w),
-            dr.select(found, distance, dr.inf), density)
+    w *= orientation * dr.sign(twist)
+    return exists, geometry.Connection(
+        mi.Point3f(a * c0, a * s0, w), mi.Point3f(a * c1, a * s1, w), distance,
+        geometry.area_density(distance, w, twist))

@@ -133,10 +133,10 @@ def test_further_geodesics_are_those_of_the_scan(rgb, twist):
             expected += [*roots, None, None][:2] if len(roots) < 2 else roots
         p, q = (columns([pair[i] for pair in pairs], 2) for i in (0, 1))
         second = mi.Bool(dr.arange(mi.UInt32, 2 * len(pairs)) % 2 == 1)
-        direction, arrival, distance, density = further_geodesic(
-            p, q, mi.Float(twist), mi.Float(m), second)
-        reached = dr.isfinite(distance)
-        end, at_end = geometry.flow(p, direction, dr.select(reached, distance, 0), twist)
+        reached, way = further_geodesic(p, q, mi.Float(twist), mi.Float(m), second)
+        direction, arrival, distance, density = (way.direction, way.arrival, way.distance,
+                                                 way.area_density)
+        end, at_end = geometry.flow(p, mi.Vector3f(direction), distance, twist)
         miss = dr.norm(end - q) / (1 + dr.norm(q))
         for i, found in enumerate(expected):
             exists = found is not None

@@ -435,10 +435,8 @@ def further_misses(count=20_000):
     misses = []
     for m in (1, 2, 3):
         for second in (False, True):
-            direction, _, distance, _ = further_geodesic(p, q, mi.Float(1), mi.Float(m),
-                                                         mi.Bool(second))
-            exists = dr.isfinite(distance)
-            end, _ = geometry.flow(p, direction, dr.select(exists, distance, 0), 1)
+            exists, way = further_geodesic(p, q, mi.Float(1), mi.Float(m), mi.Bool(second))
+            end, _ = geometry.flow(p, mi.Vector3f(way.direction), way.distance, 1)
             miss = dr.norm(mi.Vector3f(end - q)) / (1 + dr.norm(mi.Vector3f(q)))
             misses.extend(dr.gather(mi.Float, miss, dr.compress(exists)))
     return sorted(misses)
