@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
-from .quotient import Space
+from .quotient import Space, opaque
 from .tracer import Hit
 
 # Emitters that have a meaning in Nil, by the name of their class. (Mitsuba itself samples no
@@ -220,19 +220,14 @@ class Lights:
         self.images = Images(space, max_distance) if space.quotient else None
 
     def _point_positions(self, emitters, names):
-        """Positions (cells) of the point-like emitters, by their index among all emitters."""
-        at = [mi.Point3f(0)] * len(emitters)
+        """Positions (scene) of the point-like emitters, by their index among all emitters."""
+        at = [[0.0, 0.0, 0.0]] * len(emitters)
         for i, (emitter, name) in enumerate(zip(emitters, names)):
             if name in POINT:
                 # Mitsuba tells the position of every kind in a direction sample.
-                reference = dr.zeros(mi.Interaction3f)
-                sample, _ = emitter.sample_direction(reference, mi.Point2f(0.5))
-                p = self.space.to_cells(mi.Point3f(sample.p))
-                if self.space.quotient:
-                    p = mi.Point3f(geometry.wrap(p, self.space.twist)[0])
-                at[i] = p
-        columns = [mi.Float([p[axis][0] for p in at]) for axis in range(3)]
-        return mi.Point3f(*columns)
+                sample, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
+                at[i] = [sample.p[axis][0] for axis in range(3)]
+        return opaque(mi.Point3f(*(mi.Float([p[axis] for p in at]) for axis in range(3))))
 
     # ---------------------------------------------------------------- sampling
 
@@ -265,8 +260,8 @@ class Lights:
             sample = dr.select(lit, found, sample)
         if self.has_point:
             lit = among(mi.EmitterFlags.DeltaPosition)
-            position = dr.gather(mi.Point3f, self.positions, index, lit)
-            found = self._sample_point(emitter, position, si, p, u.x, image_u1, image_u2, lit)
+            light = dr.gather(mi.Point3f, self.positions, index, lit)
+            found = self._sample_point(emitter, light, si, p, u.x, image_u1, image_u2, lit)
             sample = dr.select(lit, found, sample)
         sample.weight *= weight
         sample.pdf /= weight
@@ -317,8 +312,11 @@ class Lights:
                            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False),
                            lobe_angle(density))
 
-    def _sample_point(self, emitter, q, si, p, u, u1, u2, active):
+    def _sample_point(self, emitter, light, si, p, u, u1, u2, active):
         space = self.space
+        q = space.to_cells(light)
+        if space.quotient:
+            q = mi.Point3f(geometry.wrap(q, space.twist)[0])
         image, probability = self._image_of(p, q, u1, u2)
         way = geometry.connect(p, image, space.twist)
         if self.has_further:
@@ -334,17 +332,20 @@ class Lights:
             probability *= dr.select(further, 0.25 / dr.maximum(count, 1),
                                      dr.select(count > 0, 0.5, 1))
 
-        # One scene unit before the light on the geodesic's last direction: what the emitter sends
-        # there is its intensity.
+        # What the emitter sends along the geodesic's last direction is its intensity: at a distance
+        # L before the light L² times what it brings. Far beyond the light's own coordinates, so
+        # that they take no digits of the direction.
+        L = 8 * (1 + dr.max(dr.abs(light)))
         reference = dr.zeros(mi.Interaction3f)
-        light = emitter.sample_direction(reference, mi.Point2f(0.5), active)[0].p
-        reference.p = light - mi.Vector3f(way.arrival)
+        reference.p = dr.fma(-L, mi.Vector3f(way.arrival), light)
         reference.wavelengths, reference.time = si.wavelengths, si.time
         ds, intensity = emitter.sample_direction(reference, mi.Point2f(0.5), active)
         density = dr.abs(way.area_density) * dr.square(space.size)
         reached = active & (density > 0) & (way.distance <= self.max_distance) & (ds.pdf > 0)
+        intensity *= dr.square(L)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(mi.Vector3f(way.direction), mi.Float(way.distance), weight, mi.Float(0), mi.Bool(True), mi.Float(0))
+        return LightSample(mi.Vector3f(way.direction), mi.Float(way.distance), weight,
+                           mi.Float(0), mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
 
