@@ -203,10 +203,9 @@ class Lights:
         self.has_point = any(name in POINT for name in names)
         self.has_infinite = any(name in DIRECTIONAL + ENVIRONMENT for name in names)
         self.exist = self.has_area or self.has_point or self.has_infinite
-        varying = [mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-                   for emitter, name in zip(emitters, names) if name == "AreaLight"]
-        self.has_textured_area = any(varying)
-        self.has_plain_area = not all(varying)
+        self.textures = []
+        if self.has_area:
+            self._number_area_lights(emitters, names)
 
         weights = [emitter.sampling_weight() for emitter in emitters]
         self.uniform = all(weight == weights[0] for weight in weights)
@@ -228,6 +227,28 @@ class Lights:
                 sample, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
                 at[i] = [sample.p[axis][0] for axis in range(3)]
         return opaque(mi.Point3f(*(mi.Float([p[axis] for p in at]) for axis in range(3))))
+
+    def _number_area_lights(self, emitters, names):
+        """Tables of the densities of points on area lights, by the number of the emitter's pointer.
+
+        An untextured light has one density per coordinate area (scene units). It is asked of each
+        shape by itself: asked of an array of shapes, every kind that lives in the process answers,
+        those that cannot be lights with an exception.
+        """
+        pointers = list(dr.reinterpret_array(mi.UInt32, self.scene.emitters_dr()))
+        densities = [0.0] * (max(pointers) + 1)
+        textures = [-1] * len(densities)
+        for emitter, name, pointer in zip(emitters, names, pointers):
+            if name != "AreaLight":
+                continue
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+                textures[pointer] = len(self.textures)
+                self.textures.append(_radiance_texture(emitter))
+            else:
+                densities[pointer] = _density_on(emitter.get_shape())
+        self.area_densities = opaque(mi.Float(densities))
+        if self.textures:
+            self.texture_numbers = opaque(mi.Int32(textures))
 
     # ---------------------------------------------------------------- sampling
 
@@ -375,33 +396,49 @@ class Lights:
         space = self.space
         lit = active & (emitter != None)  # noqa: E711 - an array of pointers
         q = space.to_cells(si.p)
-        # Density on the surface per unit of coordinate area
-        per_area = mi.Float(0)
-        if self.has_plain_area:
-            ps = dr.zeros(mi.PositionSample3f)
-            ps.p, ps.n, ps.uv = si.p, si.n, si.uv
-            per_area = si.shape.pdf_position(ps, lit)
-        if self.has_textured_area:
-            # Per solid angle at unit distance, face to face: per unit of area
-            varying = lit
-            if self.has_plain_area:
-                varying = lit & mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-            ds = dr.zeros(mi.DirectionSample3f)
-            ds.uv, ds.dist, ds.n, ds.d = si.uv, 1, mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, -1)
-            textured = emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, varying)
+        back = mi.Vector3f(si.n.x, si.n.y - space.twist * q.x * si.n.z, si.n.z)
+        # |N| is lost in the Nil unit normal, which has length 1/|N| as a Euclidean normal.
+        stretch = dr.rcp(dr.norm(back))
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        # Density on the surface per unit of Nil's area
+        per_area = dr.gather(mi.Float, self.area_densities, number, lit) / stretch
+        if self.textures:
+            texture = dr.gather(mi.Int32, self.texture_numbers, number, lit)
+            varying = lit & (texture >= 0)
+            # Not an array of textures, of which every kind that lives in the process would answer
+            per_uv = dr.switch(dr.select(varying, mi.UInt32(texture), 0),
+                               [texture.pdf_position for texture in self.textures], si.uv, varying)
+            textured = per_uv / dr.norm(dr.cross(si.dp_du, si.dp_dv))
             per_area = dr.select(varying, textured, per_area)
 
         density = geometry.area_density(hit.distance, hit.arrival.z, space.twist)
         density *= dr.square(space.size)
-        # |N| is lost in the Nil unit normal, which has length 1/|N| as a Euclidean normal.
-        back = mi.Vector3f(si.n.x, si.n.y - space.twist * q.x * si.n.z, si.n.z)
-        stretch = dr.rcp(dr.norm(back))
         cosine = dr.abs(dr.dot(si.n, hit.arrival))
         half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance
-        pdf = per_area * density / (stretch * cosine)
+        pdf = per_area * density / cosine
         if self.images is not None:
             pdf *= self.images.probability(p, q, g)
         return dr.select(lit & (half_turn < dr.pi) & (cosine > 0), pdf, 0)
+
+
+def _density_on(shape):
+    """Density per coordinate area (scene units) with which Mitsuba draws points of a shape."""
+    try:
+        return shape.pdf_position(dr.zeros(mi.PositionSample3f))[0]
+    except RuntimeError as error:
+        name = f' "{shape.id()}"' if shape.id() else ""
+        raise RuntimeError(
+            f"the {shape.class_name()}{name} cannot be an area light, as Mitsuba draws no points "
+            "on shapes of its kind: put the light on a mesh, a sphere, a cylinder, a disk or a "
+            "rectangle."
+        ) from error
+
+
+def _radiance_texture(emitter):
+    """The texture of an area light: the only one among what hangs on it directly."""
+    nodes = mi.traverse(emitter).hierarchy
+    return next(node for node, (_, depth) in nodes.items()
+                if depth == 1 and isinstance(node, mi.Texture))
 
 
 def _symmetric_height(p, q, twist):
