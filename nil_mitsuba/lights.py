@@ -341,17 +341,21 @@ class Lights:
         image, probability = self._image_of(p, q, u1, u2)
         way = geometry.connect(p, image, space.twist)
         if self.has_further:
-            # Half of the samples go to the minimising geodesic where there may be others.
+            # One in (count + 1) goes to the minimising geodesic, the dimmest as a rule. Those of
+            # the last intervals, seen from them as number n = 1, 2, … have 1/A ~ 1/n.
             count = further_intervals(p, image, space.twist, self.max_distance)
-            further = (count > 0) & (u >= 0.5)
-            v = dr.select(further, 2 * u - 1, 0) * count
-            m = dr.minimum(dr.floor(v), count - 1) + 1
-            second = (v - dr.floor(v)) >= 0.5
+            minimising = dr.rcp(1 + count)
+            further = u >= minimising
+            v = 2 * (u - minimising) / (1 - minimising)
+            second = v >= 1
+            v = dr.select(second, v - 1, v)
+            n = dr.clip(dr.floor(dr.power(1 + count, v)), 1, count)
+            m = count + 1 - n
             exists, other = further_geodesic(p, image, space.twist, m, second)
             way = dr.select(further, other, way)
             active &= ~further | exists
-            probability *= dr.select(further, 0.25 / dr.maximum(count, 1),
-                                     dr.select(count > 0, 0.5, 1))
+            chosen = dr.log((n + 1) / n) / dr.log(1 + count)
+            probability *= dr.select(further, 0.5 * (1 - minimising) * chosen, minimising)
 
         # What the emitter sends along the geodesic's last direction is its intensity: at a distance
         # L before the light L² times what it brings. Far beyond the light's own coordinates, so
