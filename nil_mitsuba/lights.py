@@ -203,7 +203,7 @@ class Lights:
         self.has_point = any(name in POINT for name in names)
         self.has_infinite = any(name in DIRECTIONAL + ENVIRONMENT for name in names)
         self.exist = self.has_area or self.has_point or self.has_infinite
-        self.textures = []
+        self.textures: list[mi.Texture] = []
         if self.has_area:
             self._number_area_lights(emitters, names)
 
