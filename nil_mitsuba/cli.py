@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import __version__, checkpoint, exr, jobs, png, stills
+from .errors import cause_of
 from .layers import GUIDES
 from .output import Output, metadata_of, software
 from .registration import refusal
@@ -144,6 +145,16 @@ class RenderOptions(PictureOptions):
     properties: tuple[tuple[str, str], ...]
     fit: bool
 
+    def note(self, sentence: str) -> None:
+        """Say something that is no error."""
+        if not self.quiet:
+            _note(sentence)
+
+    def tell(self, path: Path) -> None:
+        """Print the name of a file that is written."""
+        if not self.quiet:
+            click.echo(path)
+
     @property
     def clustered(self) -> bool:
         return bool(self.scheduler or self.workers)
@@ -234,7 +245,7 @@ def picture_options(command):
     help="Sensor to render with, in the scene's order.",
 )  # fmt: skip
 @click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress bar, no notes.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
 @click.option(
     "-P", "--property", "properties", metavar="NAME=VALUE", type=Assignment(), multiple=True,
@@ -268,7 +279,7 @@ def merge(parts, output, **picture):
             f'"{exr_path}" holds samples and is none of the parts: remove it, or name another file.'
         )
 
-    _set_variant(checkpoint.peek(parts[0])["variant"], 0)
+    _set_variant(checkpoint.peek(parts[0])["variant"])
     state = checkpoint.load(parts[0])
     commands = [state.about.get("commandLine")]
     for part in parts[1:]:
@@ -324,10 +335,11 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         sentence, status = "interrupted, no picture was written.", 130
     except Exception as error:
+        cause = cause_of(error)
         verbose = sum(arg.count("v") for arg in sys.argv if re.fullmatch("-v+", arg))
         if verbose > 1:
             raise
-        sentence, status = tidy(str(error) or type(error).__name__), 1
+        sentence, status = tidy(str(cause) or type(cause).__name__), 1
     click.echo(f"nil-mitsuba: {sentence}", err=True)
     sys.exit(status)
 
@@ -361,8 +373,8 @@ def _render(options: RenderOptions) -> None:
     if options.denoise:
         _require_denoiser()
 
-    note = _silence if options.quiet else _note
-    _set_variant(options.mode, options.verbose)
+    note = options.note
+    _set_variant(options.mode, options.verbose, options.quiet)
     dr.set_thread_count(options.threads or dr.thread_count())
     opened = jobs.open_scene(options.job(rules, paths.sums), note)
     about = {
@@ -403,7 +415,7 @@ def _still(opened: jobs.Opened, rules: stills.Rules, options: RenderOptions) -> 
 def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: Paths,
                   options: RenderOptions) -> None:
     """Render in passes, until all are done, a rule is met or a signal comes; write the files."""
-    sums_path, count = paths.sums, still.count
+    sums_path, count, note = paths.sums, still.count, options.note
     first, stop = options.passes or (0, count)
     state = still.start(sums_path, options.resume)
     if options.passes:
@@ -419,8 +431,8 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
         job = replace(opened.job, path=os.path.abspath(options.scene), pass_spp=still.passes.spp)
         parts = cluster.render(still, job, still.todo(state, first, stop), options.scheduler,
                                options.workers or 1, options.threads,
-                               lambda sentence: _note(tidy(sentence)))
-    saver = stills.Saver(sums_path, _note)
+                               lambda sentence: note(tidy(sentence)))
+    saver = stills.Saver(sums_path, _note)  # what it says is an error, though not the end
     with contextlib.closing(parts), _Bar(still, options.quiet) as bar:
         state, number = still.accumulate(state, parts, bar, saver)
     if not state.sums.count:
@@ -445,9 +457,9 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
             raise Stopped(f"interrupted before the picture was written. {there}",
                           next(iter(signals), signal.SIGINT)) from None
         except Exception as error:
-            raise click.ClickException(f"{tidy(str(error))} {there}") from error
+            raise click.ClickException(f"{tidy(str(cause_of(error)))} {there}") from error
     for path in written:
-        click.echo(path)
+        options.tell(path)
     if number:
         there = f'the same command with --resume goes on from "{sums_path}"'
         raise Stopped(
@@ -486,7 +498,7 @@ def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
     picture = stills.Picture(channels, image, {}, exr.component_format(film))
     paths.output(options, ()).write(picture, metadata)
     for path in paths.pictures:
-        click.echo(path)
+        options.tell(path)
 
 
 class _Bar:
@@ -605,18 +617,13 @@ def _note(sentence: str) -> None:
     click.echo(sentence, err=True)
 
 
-def _silence(_sentence: str) -> None:
-    pass
-
-
 # ---------------------------------------------------------------------- Mitsuba
 
 
-def _set_variant(variant: str, verbose: int) -> None:
-    """Set a variant, if it can run "nil"."""
-    mi.set_log_level(
-        (mi.LogLevel.Warn, mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[min(verbose, 3)]
-    )
+def _set_variant(variant: str, verbose: int = 0, quiet: bool = False) -> None:
+    """Set a variant, if it can run "nil", and what Mitsuba tells besides errors."""
+    level = (mi.LogLevel.Warn, mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
+    mi.set_log_level(mi.LogLevel.Error if quiet else level[min(verbose, 3)])
     if variant in mi.variants():
         sentence = refusal(variant)
         if sentence:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
+import mitsuba as mi
 
 try:
     import distributed
@@ -260,6 +261,8 @@ def dask_setup(_worker) -> None:
     """Called in worker processes that are started here."""
     # Ctrl-C reaches all processes of a terminal, and the first of them decides what it means
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # What Mitsuba warns of, the command itself has said
+    mi.set_log_level(mi.LogLevel.Error)
 
 
 def _render_part(job, first, stop, threads):

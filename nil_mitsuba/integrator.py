@@ -10,6 +10,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from . import geometry, parameters
 from .camera import Camera
+from .errors import raising_causes
 from .interaction import offset, surface_interaction
 from .layers import LAYERS, channel_names
 from .lights import Lights, LightSample, lobe_angle
@@ -99,6 +100,7 @@ class NilIntegrator(ADIntegrator):
         """Names of the channels that the layers add to the picture's."""
         return channel_names(self.layers)
 
+    @raising_causes
     def sample(self, mode, scene, sampler, ray, active=True, **_):
         """One sample per ray, for integrators that wrap this one (``moment``, ``aov``).
 

@@ -2,7 +2,8 @@
 
 Dr.Jit loads LLVM while it is imported and takes what it finds in the system's library folder. Too
 old an LLVM aborts the process in the middle of a render (LLVM 15: "Cannot select fminimum"), so
-the choice is made before, and what Dr.Jit ended up with is checked before a variant needs it.
+the choice is made before, and what Dr.Jit ended up with is checked before a variant needs it. So is
+the GPU of variants that compile for one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import importlib.metadata
 import os
 import re
 import sys
+from typing import NamedTuple
 
 OLDEST = 19  # 14 is refused by Dr.Jit, 15 aborts, 16 to 18 are untried; 19 and 23 are known to work
 WHEEL = "karellen-llvm-core"
@@ -34,6 +36,20 @@ SYSTEM_FOLDERS = (
     "/usr/local/lib*",
     os.path.join(sys.prefix, "lib"),
 )
+
+
+
+class Gpu(NamedTuple):
+    """Name of a backend in Dr.Jit, and what it needs."""
+
+    name: str
+    needs: str
+
+
+GPUS = {
+    "cuda": Gpu("CUDA", "an NVIDIA GPU and its driver"),
+    "metal": Gpu("Metal", "an Apple GPU"),
+}
 
 _too_late = False
 _rejected: list[str] = []  # libraries that would have been chosen, each with the loader's objection
@@ -93,8 +109,20 @@ def require(variant: str) -> None:
             raise ImportError(sentence)
 
 
+def require_gpu(variant: str) -> None:
+    """Raise an ImportError with one sentence if `variant` needs a GPU that is not there."""
+    import drjit as dr
+
+    backend, _, rest = variant.partition("_")
+    if backend in GPUS and not dr.has_backend(getattr(dr.JitBackend, GPUS[backend].name)):
+        raise ImportError(
+            f'the variant "{variant}" needs {GPUS[backend].needs}, and Dr.Jit finds none here: '
+            f'use "llvm_{rest}", which needs none.'
+        )
+
+
 class Guard(importlib.abc.MetaPathFinder):
-    """Stops the import of Mitsuba's LLVM variants while there is no usable LLVM.
+    """Stops the import of Mitsuba's variants while there is no usable LLVM or GPU for them.
 
     ``set_variant`` imports ``mitsuba.<variant>`` on first use. Raising there, rather than in a
     variant callback, leaves the current variant alone and lets
@@ -105,6 +133,7 @@ class Guard(importlib.abc.MetaPathFinder):
         package, _, name = fullname.partition(".")
         if package == "mitsuba":
             require(name)
+            require_gpu(name)
         return None
 
 

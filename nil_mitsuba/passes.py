@@ -13,6 +13,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from .camera import Camera
+from .errors import raising_causes
 from .layers import LAYERS, channel_names
 from .sums import Sums, develop, luminance
 
@@ -70,6 +71,7 @@ class Passes:
         dr.make_opaque(values, moments)
         return Sums(values, moments, dr.zeros(mi.TensorXi, (crop.y, crop.x, depth)), ())
 
+    @raising_causes
     def render(self, index: int) -> Sums:
         """Render pass number ``index``, whose first seed is `pass_seed`."""
         with dr.suspend_grad():
