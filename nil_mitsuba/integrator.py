@@ -15,7 +15,7 @@ from .interaction import offset, surface_interaction
 from .layers import LAYERS, channel_names
 from .lights import Lights, LightSample, lobe_angle
 from .passes import Passes
-from .quotient import Space, multiply_cells, shape_box
+from .quotient import Space, multiply_cells, name_of, shape_box
 from .tracer import Cone, Tracer
 
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
@@ -312,18 +312,18 @@ def _warn_of_what_is_ignored(scene, integrator):
     upper = [c + integrator.cell_size for c in lower]
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
     for shape in scene.shapes():
-        name = f'"{shape.id() or shape.class_name()}"'
         reach = 0
         if integrator.quotient:
             box = shape_box(shape)
             reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
         if reach > margin:
             mi.Log(mi.LogLevel.Warn,
-                   f"nil: the shape {name} reaches {reach:.4g} scene units out of the cube "
-                   f"{lower} to {upper}: what lies outside is never seen. Move it, or set "
+                   f"nil: the shape {name_of(shape)} reaches {reach:.4g} scene units out of the "
+                   f"cube {lower} to {upper}: what lies outside is never seen. Move it, or set "
                    "cell_origin and cell_size.")
         if shape.is_medium_transition():
-            mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name} is ignored.")
+            mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is "
+                                     "ignored.")
 
 
 class View:

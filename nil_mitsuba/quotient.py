@@ -7,6 +7,9 @@ affine, so a straight chord stays straight when it is carried into the neighbour
 
 from __future__ import annotations
 
+import re
+from textwrap import shorten
+
 import drjit as dr
 import mitsuba as mi
 
@@ -25,6 +28,23 @@ def shape_box(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
     if shape.is_mesh():
         shape.recompute_bbox()
     return shape.bbox()
+
+
+def name_of(shape: mi.Shape) -> str:
+    """How a sentence names a shape: its id in quotation marks, or its type, file and place.
+
+    Meshes that are merged while a scene is loaded have lost their ids; their files tell them.
+    """
+    if shape.id():
+        return f'"{shape.id()}"'
+    words = [shape.class_name()]
+    file = re.search(r'^  name = "(.+)",$', str(shape), re.M) if shape.is_mesh() else None
+    if file and "." in file[1]:  # not a mesh that Mitsuba has made
+        words.append(f'"{shorten(file[1], 60, placeholder=" ...")}"')
+    box = shape_box(shape)
+    if box.valid():
+        words.append("at ({:.4g}, {:.4g}, {:.4g})".format(*box.center()))
+    return " ".join(words)
 
 
 def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:

@@ -106,26 +106,25 @@ class Still:
     if the integrator is not "nil" itself, which renders passes.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: int = 0, integrator=None, seed: int = 0,
-                 rules: Rules = Rules(), pass_spp: int | None = None,
-                 scene_hash: str | None = None):
+    def __init__(self, scene: mi.Scene, sensor: int | mi.Sensor = 0,
+                 integrator: mi.Integrator | None = None, seed: int = 0, rules: Rules = Rules(),
+                 pass_spp: int | None = None, scene_hash: str | None = None):
         from .passes import Passes  # of the current variant
 
         integrator = integrator or scene.integrator()
+        if integrator is None:
+            raise ValueError('the scene has no integrator: give it one of the type "nil", or pass '
+                             'integrator=mi.load_dict({"type": "nil"}).')
         if not hasattr(integrator, "view"):
             raise ValueError(
                 f'the integrator "{type(integrator).__name__}" renders in one go: only "nil" '
                 "itself, with no other integrator around it, renders in passes."
             )
-        seed, sensor = operator.index(seed), operator.index(sensor)  # they may be NumPy's
+        seed = operator.index(seed)  # it may be NumPy's
         if not 0 <= seed < 2**32:
             raise ValueError(f"seed is a whole number from 0 to 2^32 - 1, and it is {seed}.")
-        if not 0 <= sensor < len(scene.sensors()):
-            raise ValueError(
-                f"the scene has {len(scene.sensors())} sensors, numbered from 0, and sensor is "
-                f"{sensor}."
-            )
-        self.film = scene.sensors()[sensor].film()
+        sensor, name = _sensor(scene, sensor)
+        self.film = sensor.film()
         if pass_spp is None and (rules.seconds or rules.noise):
             pass_spp = max(1, LOOK_SAMPLES // dr.prod(self.film.crop_size()))
             pass_spp = min(pass_spp, rules.spp or pass_spp)
@@ -134,8 +133,8 @@ class Still:
             rules = Rules(spp=self.passes.count * self.passes.spp)
         self.rules = rules
         self.settings = {
-            "scene": scene_hash or hash_of_scene(scene),
-            "sensor": sensor,
+            "scene": scene_hash or hash_of(scene),
+            "sensor": name,
             "seed": seed,
             "pass_spp": self.passes.spp,
             "sampler": self.passes.sampler.class_name(),
@@ -272,8 +271,8 @@ class Saver:
 
 def render(
     scene: mi.Scene,
-    sensor: int = 0,
-    integrator=None,
+    sensor: int | mi.Sensor = 0,
+    integrator: mi.Integrator | None = None,
     *,
     spp: int | None = None,
     seconds: float | None = None,
@@ -285,10 +284,11 @@ def render(
 ) -> mi.TensorXf:
     """Render a still until it has `spp` samples per pixel, or `seconds` or `noise` are reached.
 
-    Without any of the three the scene's sample count holds. `integrator` (the scene's, if None) has
-    to be "nil". The image is a tensor, height × width × channels, those of the integrator's layers
-    (`aovs`) behind the picture's. `noise` is the relative error that `nil_mitsuba.stills.noise`
-    estimates. `progress` is called between passes with a ``stills.Progress``.
+    Without any of the three the scene's sample count holds. `sensor` is a number or a sensor, as in
+    ``mi.render``; `integrator` (the scene's, if None) has to be "nil". The image is a tensor,
+    height × width × channels, those of the integrator's layers (`aovs`) behind the picture's.
+    `noise` is the relative error that `nil_mitsuba.stills.noise` estimates. `progress` is called
+    between passes with a ``stills.Progress``.
 
     At least once a minute and at the end the sums are written to the file `checkpoint`; with
     `resume` they are read from there first, if it exists, and `seconds` and `spp` count what was
@@ -465,23 +465,39 @@ def film_of(settings: dict) -> mi.Film:
     })
 
 
-def hash_of_scene(scene: mi.Scene) -> str:
-    """SHA-256 of a loaded scene: of its description and of all arrays that it lets one see.
+def hash_of(thing: mi.Scene | mi.Sensor) -> str:
+    """SHA-256 of what is loaded: of its description and of all arrays that it lets one see.
 
     Numbers of samples are no part of it: each render in between sets them.
     """
     text = re.sub(r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+", "",
-                  str(scene))
+                  str(thing))
     digest = hashlib.sha256(text.encode())
-    parameters = mi.traverse(scene)
-    for key in sorted(parameters.keys()):
-        value = parameters[key]
+    traversed = mi.traverse(thing)
+    for key in sorted(traversed.keys()):
+        value = traversed[key]
         digest.update(key.encode())
         if dr.is_array_v(value) and dr.width(value):
             digest.update(dr.ravel(value).memview())
         else:
             digest.update(str(value).encode())
     return digest.hexdigest()
+
+
+def _sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> tuple[mi.Sensor, int | str]:
+    """A sensor, and what tells it from others: its number in the scene, or a hash if it has none.
+
+    Raises ValueError for a number that no sensor has.
+    """
+    sensors = scene.sensors()
+    if isinstance(sensor, mi.Sensor):
+        return sensor, sensors.index(sensor) if sensor in sensors else hash_of(sensor)
+    number = operator.index(sensor)  # it may be NumPy's
+    if not 0 <= number < len(sensors):
+        raise ValueError(
+            f"the scene has {len(sensors)} sensors, numbered from 0, and sensor is {number}."
+        )
+    return sensors[number], number
 
 
 def versions() -> dict[str, str]:

@@ -664,10 +664,10 @@ def test_a_scene_made_in_python_has_the_same_hash_in_every_process(small, fresh_
     code = (
         "import nil_mitsuba, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"
         "import test_stills\nfrom nil_mitsuba import stills\n"
-        "print(stills.hash_of_scene(mi.load_dict(test_stills.description())))"
+        "print(stills.hash_of(mi.load_dict(test_stills.description())))"
     )
     run = fresh_python(code, PYTHONPATH="tests")
-    assert run.stdout.strip() == stills.hash_of_scene(small), run.stderr
+    assert run.stdout.strip() == stills.hash_of(small), run.stderr
 
 
 def test_settings_are_plain_values(small):
