@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import struct
 import sys
@@ -72,7 +73,7 @@ class Checkpoint:
         for key, shape in header["arrays"].items():
             kind = ARRAYS[key]
             flat, tensor = {"d": (mi.Float64, mi.TensorXd), "i": (mi.Int32, mi.TensorXi)}[kind]
-            stop = start + struct.calcsize(kind) * _product(shape)
+            stop = start + struct.calcsize(kind) * math.prod(shape)
             items = memoryview(data)[start:stop].cast(kind)  # type: ignore[call-overload]
             # A copy, in memory as sums in the making are: the same kernels go on with it
             values = dr.zeros(flat, 0) if 0 in shape else flat(items) + dr.opaque(flat, 0)
@@ -150,13 +151,6 @@ def _header(data: bytes, name: str) -> tuple[dict, int]:
         if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
             return json.loads(data[start:stop]), stop
     raise ValueError(f"{name} is damaged: its checksum is wrong.")
-
-
-def _product(shape) -> int:
-    product = 1
-    for size in shape:
-        product *= size
-    return product
 
 
 def _differences(ours: dict, theirs: dict) -> Iterator[str]:

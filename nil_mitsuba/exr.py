@@ -100,15 +100,6 @@ def write(
         _write(part, parts)
 
 
-def read_metadata(path: str | os.PathLike) -> dict[str, object]:
-    """Attributes of an OpenEXR file other than those that say how its pixels are stored.
-
-    Of a file of several parts, those of the first. Raises OSError and ValueError.
-    """
-    first = exr_header.read(path)[0]
-    return {name: value for name, (_, value) in first.items() if name not in STRUCTURE}
-
-
 def describe(path: str | os.PathLike) -> str:
     """Size, compression, layers with their types, and metadata of an OpenEXR file, as text.
 
