@@ -203,9 +203,10 @@ class Lights:
         self.has_point = any(name in POINT for name in names)
         self.has_infinite = any(name in DIRECTIONAL + ENVIRONMENT for name in names)
         self.exist = self.has_area or self.has_point or self.has_infinite
-        self.textures: list[mi.Texture] = []
+        self.textures: list[mi.Texture] = []  # of the radiance of textured area lights
         if self.has_area:
             self._number_area_lights(emitters, names)
+            self.turned_spheres = self._turned_spheres(emitters, names)
 
         weights = [emitter.sampling_weight() for emitter in emitters]
         self.uniform = all(weight == weights[0] for weight in weights)
@@ -250,6 +251,25 @@ class Lights:
         if self.textures:
             self.texture_numbers = opaque(mi.Int32(textures))
 
+    def _turned_spheres(self, emitters, names):
+        """Centres (scene) of glowing spheres whose normals Mitsuba forgets to turn, and which way
+        those point, as points by the emitter's index; None if there are none."""
+        centres, sides = [[0.0, 0.0, 0.0]] * len(emitters), [0.0] * len(emitters)
+        for i, (emitter, name) in enumerate(zip(emitters, names)):
+            shape = emitter.get_shape() if name == "AreaLight" else None
+            if shape is None or shape.class_name() != "Sphere":
+                continue
+            u = mi.Point2f(0.3, 0.6)
+            ps, centre = shape.sample_position(0, u), shape.bbox().center()
+            outward = dr.normalize(ps.p - mi.Point3f(centre))
+            side = dr.sign(dr.dot(ps.n, mi.warp.square_to_uniform_sphere(u)))
+            if (side * dr.dot(outward, ps.n))[0] < 1 - 1e-5:
+                centres[i], sides[i] = list(centre), side[0]
+        if not any(sides):
+            return None
+        return opaque((mi.Point3f(*(mi.Float([c[axis] for c in centres]) for axis in range(3))),
+                       mi.Float(sides)))
+
     # ---------------------------------------------------------------- sampling
 
     def sample(self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Bool
@@ -277,7 +297,7 @@ class Lights:
             sample = dr.select(lit, found, sample)
         if self.has_area:
             lit = among(mi.EmitterFlags.Surface)
-            found = self._sample_area(emitter, si, p, u, image_u1, image_u2, lit)
+            found = self._sample_area(emitter, index, si, p, u, image_u1, image_u2, lit)
             sample = dr.select(lit, found, sample)
         if self.has_point:
             lit = among(mi.EmitterFlags.DeltaPosition)
@@ -307,9 +327,14 @@ class Lights:
             return mi.Bool(True)
         return dr.all((q >= 0) & (q <= 1))
 
-    def _sample_area(self, emitter, si, p, u, u1, u2, active):
+    def _sample_area(self, emitter, index, si, p, u, u1, u2, active):
         space = self.space
         ps, area = emitter.sample_position(si.time, u, active)
+        if self.turned_spheres is not None:
+            centres, sides = self.turned_spheres
+            side = dr.gather(mi.Float, sides, index, active)
+            outward = dr.normalize(ps.p - dr.gather(mi.Point3f, centres, index, active))
+            ps.n = dr.select(side != 0, side * outward, ps.n)
         q = space.to_cells(ps.p)
         active = active & self._in_cube(q) & (area > 0)
         image, probability = self._image_of(p, q, u1, u2)
@@ -426,7 +451,12 @@ class Lights:
 
 
 def _density_on(shape):
-    """Density per coordinate area (scene units) with which Mitsuba draws points of a shape."""
+    """Density per coordinate area (scene units) with which Mitsuba draws points of a shape.
+
+    0 for shapes of which it draws none, and for None: it knows no shape of an "ellipsoidsmesh".
+    """
+    if shape is None:
+        return 0.0
     try:
         return shape.pdf_position(dr.zeros(mi.PositionSample3f))[0]
     except RuntimeError as error:
