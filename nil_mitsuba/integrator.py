@@ -15,7 +15,8 @@ from .interaction import offset, surface_interaction
 from .layers import LAYERS, channel_names
 from .lights import Lights, LightSample, lobe_angle
 from .passes import Passes
-from .quotient import Space, multiply_cells, name_of, shape_box
+from .quotient import Space, multiply_cells
+from .shapes import ROUNDING, ROUNDINGS, Shapes, name_of
 from .tracer import Cone, Tracer
 
 # After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
@@ -30,11 +31,6 @@ WIDENING = 0.25
 # Towards a light a ray may be off by the angle that a rough bounce would allow it, times so many
 # half angles of the light: the shadow's edge is as wide as the light.
 PENUMBRA = 3
-
-
-# A shadow ray ends this part of its length before the light. Mitsuba's own part is ten times as
-# large, which lets light through walls that it is close behind.
-SHADOW_EPSILON = 1500 * 2**-24
 
 
 class NilIntegrator(ADIntegrator):
@@ -93,8 +89,9 @@ class NilIntegrator(ADIntegrator):
 
     def view(self, scene: mi.Scene) -> View:
         """The scene as this integrator's parameters show it."""
-        _warn_of_what_is_ignored(scene, self)
-        return View(scene, self)
+        view = View(scene, self)
+        _warn_of_what_is_ignored(view.shapes, self)
+        return view
 
     def aov_names(self) -> list[str]:
         """Names of the channels that the layers add to the picture's."""
@@ -172,7 +169,7 @@ class NilIntegrator(ADIntegrator):
         while active:
             # --------------------- The next vertex ---------------------
 
-            home = mi.Vector3i(0)
+            start, home = mi.Point3f(p), mi.Vector3i(0)
             if space.quotient:
                 p, home = geometry.wrap(p, space.twist)
             limit = dr.select(depth == 0, far - spent, tracer.max_distance)
@@ -190,13 +187,14 @@ class NilIntegrator(ADIntegrator):
                 lit = active & ~bsdf_delta_prev & (emitter != None)  # noqa: E711
                 image = multiply_cells(home, hit.cell, space)
                 if lit:  # few are: most packets of rays need not compute the density
-                    em_pdf = lights.pdf(hit, si, emitter, vertex_prev, v, image, lit)
+                    em_pdf = lights.pdf(hit, si, emitter, vertex_prev, start, v, image, lit)
                     Le *= mis_weight(bsdf_pdf_prev, em_pdf)
             L += β * Le
 
             # Continue tracing the path at this point?
             active_next = (depth + 1 < depth_limit) & si.is_valid()
             bsdf = si.bsdf()
+            margin = view.margin(hit, si)
             growth = dr.select(cone.soft, WIDENING, 1) * cone.spread
             width = dr.fma(growth, hit.distance, cone.width)
 
@@ -226,13 +224,13 @@ class NilIntegrator(ADIntegrator):
                 penumbra = dr.minimum(PENUMBRA * light.angle, 1)
                 spread = dr.select(cone.soft, view.rough_spread,
                                    dr.maximum(cone.spread, view.rough_spread * penumbra))
-                active_em &= self._visible(view, si, light, Cone(width, spread), active_em)
+                active_em &= self._visible(view, si, margin, light, Cone(width, spread), active_em)
                 L += dr.select(active_em, Lr_dir, 0)
 
             # ----------------------- BSDF sampling -----------------------
 
             v = si.to_world(bsdf_sample.wo)
-            p = offset(si.p, si.n, v, space)
+            p = offset(si.p, si.n, v, margin, space)
             β *= bsdf_weight
             η *= bsdf_sample.eta
             valid |= active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type,
@@ -265,16 +263,16 @@ class NilIntegrator(ADIntegrator):
 
         return dr.select(valid, L, 0), valid, seen
 
-    def _visible(self, view, si, light, cone, active):
+    def _visible(self, view, si, margin, light, cone, active):
         """Whether nothing stands between a surface and the light drawn there."""
         space, tracer = view.space, view.tracer
         p = space.to_cells(si.p)
-        start = offset(si.p, si.n, light.direction, space)
+        start = offset(si.p, si.n, light.direction, margin, space)
         if space.quotient:
             start, home = geometry.wrap(start, space.twist)
             p = geometry.multiply(mi.Point3f(geometry.inverse(home, space.integer_twist)), p,
                                   space.twist)
-        reach = light.distance * (1 - SHADOW_EPSILON)
+        reach = light.reach
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))
         return ~tracer.occluded(p, start, light.direction, cone, reach, active, si.time)
@@ -291,7 +289,8 @@ class NilIntegrator(ADIntegrator):
             hit = tracer.intersect(p, v, cone, tracer.reach(p, v, far - spent), active, time)
             si = surface_interaction(hit, v, space, mi.Color0f())
             active &= hit.valid & (si.shape.emitter() != None)  # noqa: E711
-            p = dr.select(active, offset(si.p, si.n, hit.arrival, space), p)
+            start = offset(si.p, si.n, hit.arrival, view.margin(hit, si), space)
+            p = dr.select(active, start, p)
             v = dr.select(active, hit.arrival, v)
             cone.width = dr.select(active, dr.fma(cone.spread, hit.distance, cone.width),
                                    cone.width)
@@ -306,15 +305,19 @@ def mis_weight(pdf_a, pdf_b):
     return dr.select(dr.isfinite(w), w, 0)
 
 
-def _warn_of_what_is_ignored(scene, integrator):
-    """Log one warning each for shapes outside the quotient's cube and for media."""
+def _warn_of_what_is_ignored(shapes, integrator):
+    """Log one warning each for shapes outside the quotient's cube, for what of them lies nowhere,
+    and for media."""
     lower = list(integrator.cell_origin)
     upper = [c + integrator.cell_size for c in lower]
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
-    for shape in scene.shapes():
+    for shape, extent in zip(shapes.shapes, shapes.extents):
+        if extent.lost:
+            mi.Log(mi.LogLevel.Warn,
+                   f"nil: of the shape {name_of(shape)}, {extent.lost}: they are never seen.")
         reach = 0
-        if integrator.quotient:
-            box = shape_box(shape)
+        if integrator.quotient and extent.box.valid():
+            box = extent.box
             reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
         if reach > margin:
             mi.Log(mi.LogLevel.Warn,
@@ -333,12 +336,19 @@ class View:
         self.scene = scene
         self.space = Space(integrator.twist, integrator.quotient, list(integrator.cell_origin),
                            integrator.cell_size)
-        self.tracer = Tracer(scene, self.space, integrator.max_distance)
+        self.shapes = Shapes(scene)
+        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes.box)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
         self.layers = [layer for layer in integrator.layers if LAYERS[layer].rule != "count"]
         if "shape" in self.layers:
             self._number_shapes()
+
+    def margin(self, hit, si) -> mi.Float:
+        """How far (scene units) off a surface that was hit the next ray starts."""
+        margin = self.shapes.margin(si, hit.preliminary.t)
+        # Cells are counted from the origin
+        return dr.maximum(margin, ROUNDINGS * ROUNDING * self.space.largest)
 
     def nothing_seen(self) -> dict[str, list]:
         """The channels of each layer where a path meets nothing."""

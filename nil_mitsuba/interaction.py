@@ -63,17 +63,15 @@ def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
     return si
 
 
-def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, space: Space) -> mi.Point3f:
+def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, margin: mi.Float, space: Space
+           ) -> mi.Point3f:
     """Start (cells) of a ray that leaves a surface point ``p`` (scene) in frame direction ``d``.
 
-    The point is moved by Mitsuba's own ray epsilon, to the side that ``d`` points to, along the
+    The point is moved by ``margin`` (scene units), to the side that ``d`` points to, along the
     surface's Euclidean normal, which is got back from the conormal ``n`` (frame components). The
     metric dual of ``n`` would lead through walls that meet this one at a right angle.
     """
-    # drjit's machine epsilon × 1500, as Mitsuba's math::RayEpsilon
-    epsilon = 1500 * 2**-24
-    distance = (1 + dr.max(dr.abs(p))) * epsilon
     cells = space.to_cells(p)
     normal = mi.Vector3f(n.x, dr.fma(-space.twist * cells.x, n.z, n.y), n.z)
     normal = dr.mulsign(dr.normalize(normal), dr.dot(n, d))
-    return cells + mi.Point3f(normal) * (distance / space.size)
+    return cells + mi.Point3f(normal) * (margin / space.size)

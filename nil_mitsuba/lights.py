@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from . import geometry
 from .quotient import Space, opaque
+from .shapes import margin_on
 from .tracer import Hit
 
 # Emitters that have a meaning in Nil, by the name of their class. (Mitsuba itself samples no
@@ -26,22 +27,31 @@ ENVIRONMENT = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter", "SunskyEmit
                "TimedSunskyEmitter")
 
 
+# By what part of its length a geodesic may end beside the point it was connected to: 30 roundings.
+ARRIVAL_ROUNDING = 2**-19
+# What leaves a light at a smaller cosine is so little that it may be hidden by the light itself.
+GRAZING = 1 / 32
+
+
 class LightSample:
     """Light that may arrive at a vertex.
 
-    ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along
-    it, infinite for directional light; ``weight``: radiance over probability; ``pdf``: with
-    respect to solid angle, 0 for ``delta`` light, which no other technique finds; ``angle``: half
-    angle (radians) of the light that this image of it shows the receiver, 0 for ``delta`` light.
+    ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along it,
+    infinite for directional light, and ``reach``, before which nothing may stand in the way;
+    ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
+    light, which no other technique finds; ``angle``: half angle (radians) of the light that this
+    image of it shows the receiver, 0 for ``delta`` light.
     """
 
-    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "weight": mi.Spectrum,
+    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "reach": mi.Float,
+                    "weight": mi.Spectrum,
                     "pdf": mi.Float, "delta": mi.Bool, "angle": mi.Float}
 
-    def __init__(self, direction=None, distance=None, weight=None, pdf=None, delta=None,
-                 angle=None):
+    def __init__(self, direction=None, distance=None, reach=None, weight=None, pdf=None,
+                 delta=None, angle=None):
         self.direction = direction
         self.distance = distance
+        self.reach = reach
         self.weight = weight
         self.pdf = pdf
         self.delta = delta
@@ -238,16 +248,19 @@ class Lights:
         """
         pointers = list(dr.reinterpret_array(mi.UInt32, self.scene.emitters_dr()))
         densities = [0.0] * (max(pointers) + 1)
+        margins = [0.0] * len(emitters)
         textures = [-1] * len(densities)
-        for emitter, name, pointer in zip(emitters, names, pointers):
+        for i, (emitter, name, pointer) in enumerate(zip(emitters, names, pointers)):
             if name != "AreaLight":
                 continue
+            margins[i] = margin_on(emitter.get_shape())
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
                 textures[pointer] = len(self.textures)
                 self.textures.append(_radiance_texture(emitter))
             else:
                 densities[pointer] = _density_on(emitter.get_shape())
         self.area_densities = opaque(mi.Float(densities))
+        self.area_margins = opaque(mi.Float(margins))
         if self.textures:
             self.texture_numbers = opaque(mi.Int32(textures))
 
@@ -310,7 +323,7 @@ class Lights:
 
     def _sample_infinite(self, emitter, si, u, active):
         ds, weight = emitter.sample_direction(si, u, active)
-        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf),
+        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), mi.Float(dr.inf),
                            dr.select(ds.pdf > 0, weight, 0),
                            dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta),
                            dr.select(ds.delta, 0, lobe_angle(ds.pdf)))
@@ -354,7 +367,11 @@ class Lights:
         pdf = probability * density
         reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
         pdf = dr.select(reached, pdf, 0)
-        return LightSample(direction, way.distance,
+        # The light's own surface, met at a grazing angle, must not hide it
+        margin = dr.gather(mi.Float, self.area_margins, index, active) / space.size
+        margin = dr.fma(ARRIVAL_ROUNDING, way.distance, margin)
+        reach = way.distance - margin / dr.maximum(cosine, GRAZING)
+        return LightSample(direction, way.distance, reach,
                            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False),
                            lobe_angle(density))
 
@@ -394,22 +411,26 @@ class Lights:
         reached = active & (density > 0) & (way.distance <= self.max_distance) & (ds.pdf > 0)
         intensity *= dr.square(L)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        return LightSample(mi.Vector3f(way.direction), mi.Float(way.distance), weight,
-                           mi.Float(0), mi.Bool(True), mi.Float(0))
+        distance = mi.Float(way.distance)
+        return LightSample(mi.Vector3f(way.direction), distance,
+                           dr.fma(-ARRIVAL_ROUNDING, distance, distance), weight, mi.Float(0),
+                           mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
 
     def pdf(self, hit: Hit, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr, p: mi.Point3f,
-            v: mi.Vector3f, g: mi.Vector3i, active: mi.Bool) -> mi.Float:
+            start: mi.Point3f, v: mi.Vector3f, g: mi.Vector3i, active: mi.Bool) -> mi.Float:
         """Solid-angle density with which `sample` at ``p`` (cells) draws the light just found.
 
-        ``v``: frame direction in which the segment started; ``g``: deck element of the image that
-        was hit, relative to the cell of ``p``. 0 where `sample` could not have drawn it.
+        The segment that found it started at ``start``, beside ``p``, in the frame direction ``v``.
+        ``g``: deck element of the image that was hit, relative to the cell of ``p``. 0 where
+        `sample` could not have drawn it.
         """
         result = mi.Float(0)
         if self.has_area:
             lit = active & hit.valid
-            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, g, lit), result)
+            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, start, v, g, lit),
+                               result)
         environment = self.scene.environment()
         if environment is not None:
             ds = dr.zeros(mi.DirectionSample3f)
@@ -421,7 +442,7 @@ class Lights:
             return result * self.pmf
         return result * emitter.sampling_weight() * self.weight_scale
 
-    def _pdf_area(self, hit, si, emitter, p, g, active):
+    def _pdf_area(self, hit, si, emitter, p, start, v, g, active):
         space = self.space
         lit = active & (emitter != None)  # noqa: E711 - an array of pointers
         q = space.to_cells(si.p)
@@ -440,7 +461,9 @@ class Lights:
             textured = per_uv / dr.norm(dr.cross(si.dp_du, si.dp_dv))
             per_area = dr.select(varying, textured, per_area)
 
-        density = geometry.area_density(hit.distance, hit.arrival.z, space.twist)
+        # From the vertex itself, as `sample` does; second order in the offset is left out.
+        ahead = dr.dot(geometry.to_frame(p, mi.Vector3f(start - p), space.twist), v)
+        density = geometry.area_density(hit.distance + ahead, hit.arrival.z, space.twist)
         density *= dr.square(space.size)
         cosine = dr.abs(dr.dot(si.n, hit.arrival))
         half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance

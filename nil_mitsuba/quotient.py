@@ -7,9 +7,6 @@ affine, so a straight chord stays straight when it is carried into the neighbour
 
 from __future__ import annotations
 
-import re
-from textwrap import shorten
-
 import drjit as dr
 import mitsuba as mi
 
@@ -18,41 +15,6 @@ def opaque(value):
     """The value as an array that kernels read from memory, so that they do for any value."""
     dr.make_opaque(value)
     return value
-
-
-def shape_box(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
-    """Bounding box (scene units) of a shape.
-
-    Mitsuba 3.9.1 merges meshes while it loads a scene, and keeps the box of some of them only.
-    """
-    if shape.is_mesh():
-        shape.recompute_bbox()
-    return shape.bbox()
-
-
-def name_of(shape: mi.Shape) -> str:
-    """How a sentence names a shape: its id in quotation marks, or its type, file and place.
-
-    Meshes that are merged while a scene is loaded have lost their ids; their files tell them.
-    """
-    if shape.id():
-        return f'"{shape.id()}"'
-    words = [shape.class_name()]
-    file = re.search(r'^  name = "(.+)",$', str(shape), re.M) if shape.is_mesh() else None
-    if file and "." in file[1]:  # not a mesh that Mitsuba has made
-        words.append(f'"{shorten(file[1], 60, placeholder=" ...")}"')
-    box = shape_box(shape)
-    if box.valid():
-        words.append("at ({:.4g}, {:.4g}, {:.4g})".format(*box.center()))
-    return " ".join(words)
-
-
-def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """Bounding box (scene units) of all shapes; not valid if there are none."""
-    box = mi.ScalarBoundingBox3f()
-    for shape in scene.shapes():
-        box.expand(shape_box(shape))
-    return box
 
 
 class Space:
@@ -71,6 +33,7 @@ class Space:
         self.integer_twist = dr.opaque(mi.Int32, round(twist))
         self.origin = opaque(mi.Point3f(*origin))
         self.size = dr.opaque(mi.Float, size)
+        self.largest = dr.opaque(mi.Float, max(map(abs, origin)))  # of the origin's coordinates
         # A few units in the last place of the largest scene coordinate near the cube, in cells:
         # what Mitsuba's float32 arithmetic may lose at the joint of two chords.
         extent = 1 + max(abs(c) for c in origin) / size

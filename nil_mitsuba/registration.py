@@ -12,6 +12,7 @@ from . import llvm
 # Modules that keep types of the current variant, each after those it imports from.
 VARIANT_MODULES = (
     "nil_mitsuba.quotient",
+    "nil_mitsuba.shapes",
     "nil_mitsuba.box",
     "nil_mitsuba.tracer",
     "nil_mitsuba.interaction",

@@ -181,9 +181,9 @@ def parse_value(text: str):
 
 def fitted_cell(scene) -> dict[str, str]:
     """Properties of "nil" whose cell is the smallest cube around a scene, as text."""
-    from .quotient import scene_box  # needs a variant
+    from .shapes import Shapes  # needs a variant
 
-    bbox = scene_box(scene)
+    bbox = Shapes(scene).box
     if not bbox.valid() or max(bbox.extents()) == 0:
         raise ValueError("--fit needs a scene with shapes of some extent.")
     size = max(bbox.extents()) * (1 + FIT_MARGIN)

@@ -15,7 +15,8 @@ import mitsuba as mi
 
 from . import geometry
 from .box import Box, Passage
-from .quotient import Space, exit_through_face, opaque, scene_box, through_face
+from .quotient import Space, exit_through_face, opaque, through_face
+from .shapes import Shapes
 
 # A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
 # rough bounces, and towards lights. What a chord has missed cannot be found again, while what it
@@ -149,7 +150,8 @@ class Chords:
 class Tracer:
     """Follows geodesics through a scene, in plain Nil or in the quotient."""
 
-    def __init__(self, scene: mi.Scene, space: Space, max_distance: float):
+    def __init__(self, scene: mi.Scene, space: Space, max_distance: float,
+                 box: mi.ScalarBoundingBox3f | None = None):
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
@@ -158,7 +160,7 @@ class Tracer:
         self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
         if space.quotient:  # no ray leaves the cube
             return
-        box = scene_box(scene)
+        box = box or Shapes(scene).box
         if not box.valid():  # a scene of environment emitters only
             box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
         self.box = Box(space.to_cells(opaque(mi.Point3f(box.min))),
@@ -368,15 +370,17 @@ class Tracer:
                     s_last = dr.minimum(s_last, exit_through_face(point, along)[0])
                 speed = dr.norm(along)
                 line = along / speed
-                start = space.to_scene(dr.fma(along, s_first, point) - space.slack * line)
-                ray = line_ray(start, line, time,
-                               dr.fma(s_last - s_first, speed, 2 * space.slack) * space.size)
+                # Nothing before the ray's own start, which may be close by its surface
+                before = dr.minimum(space.slack, (at + s_first) * speed)
+                start = space.to_scene(dr.fma(along, s_first, point) - before * line)
+                ray = line_ray(start, line, time, dr.fma(s_last - s_first, speed,
+                                                         before + space.slack) * space.size)
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=looking)
                 # A tangent that meets a surface from the other side than the chord did has found
                 # where the geodesic comes back, or what lies behind its start.
                 met = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, pi.is_valid())
                 looking &= pi.is_valid() & (dr.sign(dr.dot(met.n, line)) == side)
-                s = s_first + (pi.t / space.size - space.slack) / speed
+                s = s_first + (pi.t / space.size - before) / speed
                 at = dr.select(looking, at + s, at)
                 error = 0.5 * bend.across * dr.square(s)
                 good = looking & (error <= goal)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from studio import film
+from benchmarks.studio import film
 
 SIZE = 24
 KINDS = ["perspective", "thinlens", "orthographic", "batch"]

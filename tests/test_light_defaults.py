@@ -12,11 +12,11 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
-from drjit.llvm import Array3f64, Float64
-
 import reference_geometry as reference
 import truth
+from drjit.llvm import Array3f64, Float64
 from studio import film, without_emitter_sampling, write_ply
+
 from test_lights import POOLED_Z, all_geodesics, columns, enough_cells, geodesics, independent
 from ztest import Estimate, assert_same_expectation
 

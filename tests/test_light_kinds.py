@@ -11,7 +11,6 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
-
 from studio import (
     film,
     place,
@@ -22,6 +21,7 @@ from studio import (
     write_ply,
     write_serialized,
 )
+
 from ztest import Estimate, assert_same_expectation
 
 

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import pytest
 
-from nil_mitsuba.quotient import name_of
+from nil_mitsuba.shapes import name_of
 
 TRIANGLE = "v 0.1 0.1 .9\nv 0.9 0.1 .9\nv 0.1 0.9 1.9\nf 1 3 2\n"
 

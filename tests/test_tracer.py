@@ -22,7 +22,8 @@ def test_every_ray_names_the_true_surface(rgb, kind, twist):
 
 def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
     """Mitsuba 3.9.1 merges meshes of one material while loading, but not their bounding boxes."""
-    from nil_mitsuba.quotient import Space, scene_box
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.shapes import Shapes
     from nil_mitsuba.tracer import Cone, Tracer
 
     mi = rgb
@@ -32,7 +33,7 @@ def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
                           "ceiling": {"type": "rectangle", "to_world": up([0, 0, 10]),
                                       "bsdf": grey}})
     assert len(scene.shapes()) == 1
-    assert scene_box(scene).max.z == 10
+    assert Shapes(scene).box.max.z == 10
     tracer = Tracer(scene, Space(1.0, False, [0, 0, 0], 1.0), dr.inf)
     p, v = mi.Point3f(0, 0, 5), mi.Vector3f(0, 0, mi.Float([1, -1]))
     hit = tracer.intersect(p, v, Cone(0, 1e-3), tracer.reach(p, v), mi.Bool(True))

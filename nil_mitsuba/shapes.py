@@ -1,0 +1,194 @@
+"""What is read of a scene's shapes once per render: where they are, how exact their hits are."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from textwrap import shorten
+
+import drjit as dr
+import mitsuba as mi
+
+from .quotient import opaque
+
+ROUNDING = 2**-24  # of float32, relative
+
+# By how many roundings of the largest number that goes into a hit the next ray starts off the
+# surface. A quarter is enough for meshes and spheres, the half for cylinders, of 200,000 hits each
+# (benchmarks/offsets.py); Mitsuba's own offset has 1,500, of the hit's own coordinates.
+ROUNDINGS = 32
+PRECISE = ("Sphere", "Rectangle", "Disk", "Cylinder")
+# Of other kinds little is known (curves, grids, ellipsoids, and whatever but meshes in an instance,
+# where Mitsuba 3.9 intersects scaled spheres to a few digits only).
+OTHER_ROUNDINGS = 1500
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Bounding box (scene units) of what of a shape can be hit, not valid if nothing can.
+
+    ``lost`` says what of the shape cannot, since its coordinates are no finite numbers; "" if all
+    of it can.
+    """
+
+    box: mi.ScalarBoundingBox3f
+    lost: str = ""
+
+
+class Shapes:
+    """The shapes of a scene as they are now: their extents, and the rounding of hits on them.
+
+    The boxes of meshes follow from the triangles that there are, not from Mitsuba's own boxes:
+    vertices that no triangle uses count in those, and version 3.9.1, which merges meshes while it
+    loads a scene, keeps some of them only.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        self.shapes = scene.shapes()
+        # All are on their way before the first is waited for
+        meshes = {i: _Triangles(shape) for i, shape in enumerate(self.shapes) if shape.is_mesh()}
+        self.extents = [meshes[i].extent() if i in meshes else _extent(shape)
+                        for i, shape in enumerate(self.shapes)]
+        self.box = mi.ScalarBoundingBox3f()
+        for extent in self.extents:
+            self.box.expand(extent.box)
+        self._tabulate(scene, meshes)
+
+    def _tabulate(self, scene, meshes):
+        """Tables of the largest coordinates that go into hits: of each triangle's corners, and one
+        for each other shape.
+
+        A shape's part of them begins at a place that the number of its pointer tells, together
+        with two bits: whether there is an entry for each triangle, and whether little is known.
+        """
+        names = [shape.class_name() for shape in self.shapes]
+        self.has_meshes, self.has_others = bool(meshes), len(meshes) < len(names)
+        self.has_instances = "Instance" in names
+        self.has_unknown = any(i not in meshes and name not in PRECISE
+                               for i, name in enumerate(names))
+        pointers = list(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+        places = [0] * (max(pointers, default=0) + 1)
+        others = [i for i in range(len(names)) if i not in meshes]
+        largest = [mi.Float([_largest(self.shapes[i], self.extents[i].box) for i in others])] \
+            if others else []
+        for place, i in enumerate(others):
+            places[pointers[i]] = place << 2 | (names[i] not in PRECISE) << 1
+        place = len(others)
+        for i, triangles in meshes.items():
+            places[pointers[i]] = place << 2 | 1
+            place += triangles.count
+            largest.append(triangles.largest)
+        self.places = opaque(mi.UInt32(places))
+        self.largest = opaque(dr.concat(largest) if largest else mi.Float(0))
+
+    def margin(self, si: mi.SurfaceInteraction3f, length: mi.Float) -> mi.Float:
+        """How far (scene units) from a hit a ray has to start, not to meet the surface again.
+
+        ``length`` (scene units) of the straight ray that hit counts where the hit depends on it.
+        """
+        valid = si.is_valid()
+        shape = si.shape
+        if self.has_instances:
+            shape = dr.select(si.instance == None, shape, si.instance)  # noqa: E711
+        place = dr.gather(mi.UInt32, self.places, dr.reinterpret_array(mi.UInt32, shape), valid)
+        index = place >> 2
+        if self.has_meshes:
+            by_triangle = (place & 1) == 1
+            index += dr.select(by_triangle, si.prim_index, 0)
+        largest = dr.gather(mi.Float, self.largest, index, valid)
+        if self.has_others:
+            if self.has_meshes:
+                length = dr.select(by_triangle, 0, length)
+            largest = dr.maximum(largest, length)
+        roundings = mi.Float(ROUNDINGS)
+        if self.has_unknown:
+            unknown = (place & 2) == 2
+            if self.has_instances:
+                unknown &= ~si.shape.is_mesh()
+            roundings = dr.select(unknown, OTHER_ROUNDINGS, roundings)
+        return roundings * ROUNDING * largest
+
+
+def name_of(shape: mi.Shape) -> str:
+    """How a sentence names a shape: its id in quotation marks, or its type, file and place.
+
+    Meshes that are merged while a scene is loaded have lost their ids; their files tell them.
+    """
+    if shape.id():
+        return f'"{shape.id()}"'
+    words = [shape.class_name()]
+    file = re.search(r'^  name = "(.+)",$', str(shape), re.M) if shape.is_mesh() else None
+    if file and "." in file[1]:  # not a mesh that Mitsuba has made
+        words.append(f'"{shorten(file[1], 60, placeholder=" ...")}"')
+    box = extent_of(shape).box
+    if box.valid():
+        words.append("at ({:.4g}, {:.4g}, {:.4g})".format(*box.center()))
+    return " ".join(words)
+
+
+def margin_on(shape: mi.Shape | None) -> float:
+    """How far (scene units) from any point of a shape a ray has to end, not to meet it."""
+    if shape is None:
+        return 0.0
+    extent = extent_of(shape)
+    known = shape.is_mesh() or shape.class_name() in PRECISE
+    return (ROUNDINGS if known else OTHER_ROUNDINGS) * ROUNDING * _largest(shape, extent.box)
+
+
+def extent_of(shape: mi.Shape) -> Extent:
+    """The extent of one shape."""
+    return _Triangles(shape).extent() if shape.is_mesh() else _extent(shape)
+
+
+def _extent(shape):
+    box = shape.bbox()
+    if box.valid() and not all(map(math.isfinite, (*box.min, *box.max))):
+        return Extent(mi.ScalarBoundingBox3f(), "its position or size is no finite number")
+    return Extent(box)
+
+
+def _largest(shape, box):
+    """The largest coordinate (scene units) of a shape, which for an instance may be one that it
+    would have if it were only rotated and scaled, or only moved."""
+    if not box.valid():
+        return 0.0
+    corner = [max(abs(low), abs(high)) for low, high in zip(box.min, box.max)]
+    if shape.class_name() != "Instance":
+        return max(corner)
+    matrix = mi.traverse(shape)["to_world"].matrix
+    inverse = dr.rcp(matrix)
+
+    def absolute(m):
+        return [[abs(m[i, j][0]) for j in range(4)] for i in range(3)]
+
+    turn, back = absolute(matrix), absolute(inverse)
+    moved = [c + turn[i][3] for i, c in enumerate(corner)]
+    local = [sum(row[j] * moved[j] for j in range(3)) for row in back]
+    return max(sum(row[j] * local[j] for j in range(3)) + row[3] for row in turn)
+
+
+class _Triangles:
+    """The box of a mesh's triangles and the largest coordinate of each, still to be waited for."""
+
+    def __init__(self, mesh):
+        positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
+        self.count = mesh.face_count()
+        triangle = dr.arange(mi.UInt32, self.count)
+        a, b, c = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
+                   for i in range(3))
+        finite = dr.all(dr.isfinite(a + b + c))
+        low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
+        self.largest = dr.max(dr.maximum(dr.abs(low), dr.abs(high)))
+        low, high = dr.select(finite, low, dr.inf), dr.select(finite, high, -dr.inf)
+        dr.eval(low, high, finite, self.largest)
+        self.low, self.high = [dr.min(x) for x in low], [dr.max(x) for x in high]
+        self.whole = dr.count(finite)
+
+    def extent(self):
+        box = mi.ScalarBoundingBox3f()
+        if self.whole[0]:
+            box = mi.ScalarBoundingBox3f([x[0] for x in self.low], [x[0] for x in self.high])
+        lost = self.count - self.whole[0]
+        return Extent(box, f"{lost} of its {self.count} triangles have corners that are no finite "
+                           "numbers" if lost else "")
