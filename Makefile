@@ -11,7 +11,7 @@ render: $(VENV)/.installed
 	$(BIN)/nil-mitsuba render scenes/showcase.xml -o out/showcase.exr --png out/showcase.png
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --durations=10
 
 verify: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -m verify

@@ -1,6 +1,7 @@
 """What is installed: the wheel's contents, and that it works where nothing else is."""
 
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -8,6 +9,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+import nil_mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,6 +33,11 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
     assert names == modules | {"nil_mitsuba/py.typed"}
     assert any(name.endswith("/licenses/LICENSE") for name in info)
     assert any(name.endswith("/entry_points.txt") for name in info)
+
+
+def test_who_cites_the_software_names_the_version_that_is_installed():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [nil_mitsuba.__version__]
 
 
 @pytest.mark.verify
