@@ -14,7 +14,7 @@ from nil_mitsuba.jobs import Job
 distributed = pytest.importorskip("distributed")
 
 from nil_mitsuba import cluster  # noqa: E402
-from test_stills import SCENE, TRIANGLE  # noqa: E402
+from small_stills import SCENE, TRIANGLE  # noqa: E402
 
 JOB = Job("scene.xml")
 

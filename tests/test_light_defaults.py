@@ -12,13 +12,14 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
-import reference_geometry as reference
-import truth
 from drjit.llvm import Array3f64, Float64
-from studio import film, without_emitter_sampling, write_ply
 
-from test_lights import POOLED_Z, all_geodesics, columns, enough_cells, geodesics, independent
-from ztest import Estimate, assert_same_expectation
+from benchmarks import reference_geometry as reference
+from benchmarks import truth
+from benchmarks.light_truth import all_geodesics, columns, enough_cells, geodesics
+from benchmarks.studio import film, without_emitter_sampling, write_ply
+from patches import independent
+from ztest import POOLED_Z, Estimate, assert_same_expectation
 
 # Points and unit normals of the frame there
 RECEIVERS = [

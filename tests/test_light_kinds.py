@@ -11,7 +11,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 import pytest
-from studio import (
+
+from benchmarks.studio import (
     film,
     place,
     texture,
@@ -21,7 +22,6 @@ from studio import (
     write_ply,
     write_serialized,
 )
-
 from ztest import Estimate, assert_same_expectation
 
 

@@ -36,9 +36,7 @@ from patches import (
     received,
     surface,
 )
-
-POOLED_Z = 3.5  # one in 2,100 sound estimates is further off
-
+from ztest import POOLED_Z
 
 # ------------------------------------------------------------------ one light, one patch
 

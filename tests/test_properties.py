@@ -5,7 +5,7 @@ import mitsuba as mi
 import pytest
 
 from nil_mitsuba import parameters
-from test_stills import description
+from small_stills import description
 
 
 @pytest.fixture

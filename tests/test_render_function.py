@@ -8,7 +8,7 @@ import mitsuba as mi
 import pytest
 
 import nil_mitsuba
-from test_stills import description
+from small_stills import description
 
 
 @pytest.fixture
