@@ -40,6 +40,15 @@ def test_who_cites_the_software_names_the_version_that_is_installed():
     assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [nil_mitsuba.__version__]
 
 
+def test_the_map_names_every_module_and_where_it_is_tested():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    modules = {name for row in rows for name in re.findall(r"`(\w+\.py)`", row[0])}
+    assert modules == {path.name for path in (ROOT / "nil_mitsuba").glob("*.py")} - {"__init__.py"}
+    tests = {name for row in rows for name in row[2].split(", ")}
+    assert [name for name in tests if not (ROOT / "tests" / f"test_{name}.py").exists()] == []
+
+
 @pytest.mark.verify
 def test_the_wheel_renders_in_an_empty_environment(wheel, tmp_path):
     """Nothing from this checkout or its environment takes part."""
