@@ -3,13 +3,15 @@
 import pathlib
 import re
 from dataclasses import replace
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
-from nil_mitsuba import jobs, registration, stills
+from nil_mitsuba import checkpoint, jobs, registration, stills
 from nil_mitsuba.layers import LAYERS, RENDERED
+from small_stills import TRIANGLE, equal, sums_of
 
 PACKAGE = pathlib.Path(jobs.__file__).parent
 
@@ -28,7 +30,6 @@ SCENE = """
     <shape type="obj"><string name="filename" value="triangle.obj"/></shape>
 </scene>
 """
-TRIANGLE = "v 0.1 0.1 .9\nv 0.9 0.1 .9\nv 0.1 0.9 .9\nf 1 3 2\n"
 
 
 @pytest.fixture
@@ -97,3 +98,24 @@ def test_rendering_needs_no_file_format():
         new = {name for one, several in imports for name in (one or several).split(", ")} - needed
     assert {"integrator", "sums", "layers"} <= needed
     assert not needed & {"exr", "png", "checkpoint", "stills", "scene_files"}
+
+
+def test_parts_of_processes_of_their_own_merge_to_the_whole(still_folder):
+    job = jobs.Job(str(still_folder / "scene.xml"), spp=64, pass_spp=16, seed=7)
+    still = jobs.open_still(job)
+    job = jobs.Job(job.path, spp=64, pass_spp=16, seed=7, scene_hash=still.settings["scene"])
+    parts = [jobs.render_part(job, first, stop) for first, stop in ((2, 4), (0, 1), (1, 2))]
+    states = [checkpoint.Checkpoint.from_bytes(part) for part in parts]
+    merged = reduce(checkpoint.Checkpoint.plus, states)
+    assert merged.sums.passes == ((0, 4),)
+    merged.require(still.settings)
+    assert dr.allclose(still.develop(merged), still.develop(sums_of(still, 0, 1, 2, 3)), rtol=1e-6)
+    # Without the scene, too
+    assert equal(stills.picture_of(merged).image, still.develop(merged))
+
+    with pytest.raises(ValueError, match="passes 0:1 are there twice"):
+        merged.plus(states[1])
+    (still_folder / "triangle.obj").write_text(TRIANGLE.replace(".9", ".8"))
+    jobs._opened.clear()
+    with pytest.raises(ValueError, match="differs"):
+        jobs.render_part(job, 0, 1)
