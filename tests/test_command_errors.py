@@ -1,13 +1,11 @@
 """What the command says, in one sentence, of what went wrong, and what it does not say."""
 
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import pytest
 
 import nil_mitsuba
-from nil_mitsuba import cli, errors, llvm
+from nil_mitsuba import errors, llvm
 
 SCENE = """
 <scene version="3.0.0">
@@ -63,22 +61,14 @@ def broken(rgb):
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch, capfd):
+def render(command, folder):
     """Runs the command on a scene: its status, what it printed and its complaints."""
-    monkeypatch.chdir(tmp_path)
-    level, threads = mi.log_level(), dr.thread_count()
 
     def run(scene, *arguments):
-        (tmp_path / "scene.xml").write_text(scene)
-        monkeypatch.setattr(sys, "argv", ["nil-mitsuba", "render", "scene.xml", *arguments])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        return stopped.value.code or 0, *capfd.readouterr()
+        (folder / "scene.xml").write_text(scene)
+        return command("render", "scene.xml", *arguments)
 
-    yield run
-    mi.set_log_level(level)
-    dr.set_thread_count(threads)
-    mi.set_variant("llvm_ad_rgb")
+    return run
 
 
 def material(name):
@@ -88,9 +78,9 @@ def material(name):
 # --------------------------------------------------------- errors inside of loops
 
 
-def test_an_error_of_a_plugin_while_paths_are_traced_is_told(command, broken):
+def test_an_error_of_a_plugin_while_paths_are_traced_is_told(render, broken):
     broken.append(ValueError("the material has run out of paint."))
-    assert command(material("broken"), "--spp", "1") == (
+    assert render(material("broken"), "--spp", "1") == (
         1, "", "nil-mitsuba: the material has run out of paint.\n"
     )
 
@@ -129,10 +119,10 @@ def test_an_error_without_a_cause_is_its_own():
 
 
 @pytest.mark.parametrize("variant", ["cuda_ad_rgb", "cuda_ad_spectral"])
-def test_a_gpu_that_is_not_there_is_missed_in_a_sentence(command, variant):
+def test_a_gpu_that_is_not_there_is_missed_in_a_sentence(render, variant):
     if dr.has_backend(dr.JitBackend.CUDA):
         pytest.skip("there is one here")
-    status, out, err = command(SCENE.replace("BSDF", ""), "-m", variant)
+    status, out, err = render(SCENE.replace("BSDF", ""), "-m", variant)
     assert (status, out) == (1, "")
     assert err == (
         f'nil-mitsuba: the variant "{variant}" needs an NVIDIA GPU and its driver, and Dr.Jit '
@@ -154,8 +144,8 @@ def test_a_gpu_that_is_there_is_used(monkeypatch):
 # -------------------------------------------------------------------- properties
 
 
-def test_a_misspelt_property_is_told_in_one_sentence_with_the_nearest(command):
-    status, out, err = command(SCENE.replace("BSDF", ""), "-P", "twsit=2")
+def test_a_misspelt_property_is_told_in_one_sentence_with_the_nearest(render):
+    status, out, err = render(SCENE.replace("BSDF", ""), "-P", "twsit=2")
     assert (status, out, err.count("\n")) == (1, "", 1)
     assert 'the integrator "nil" has no property "twsit": did you mean "twist"?' in err
     assert "Traceback" not in err
@@ -166,16 +156,16 @@ def test_a_misspelt_property_is_told_in_one_sentence_with_the_nearest(command):
 
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")], ids=["alone", "workers"])
 @pytest.mark.parametrize("scene", [WARNS, WITHOUT], ids=["warns", "notes"])
-def test_quiet_is_quiet(command, scene, workers):
+def test_quiet_is_quiet(render, scene, workers):
     if workers:
         pytest.importorskip("distributed")
     scene = scene.replace("BSDF", "")
-    assert command(scene, "--spp", "1", "-q", *workers) == (0, "", "")
-    status, out, err = command(scene, "--spp", "1", "-o", "b.exr")
+    assert render(scene, "--spp", "1", "-q", *workers) == (0, "", "")
+    status, out, err = render(scene, "--spp", "1", "-o", "b.exr")
     assert status == 0 and out.endswith("b.exr\n")
     assert "reaches" in out + err or "has no integrator" in out + err
 
 
-def test_quiet_tells_errors(command):
-    status, out, err = command(SCENE.replace("BSDF", ""), "-q", "-P", "twist=0.5")
+def test_quiet_tells_errors(render):
+    status, out, err = render(SCENE.replace("BSDF", ""), "-q", "-P", "twist=0.5")
     assert (status, out) == (1, "") and "does not glue the faces" in err
