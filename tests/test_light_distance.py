@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import pytest
-from studio import film, gradient
 
 import nil_mitsuba
+from benchmarks.studio import film, gradient
 from test_light_kinds import nil
 
 KINDS = ["point", "spot", "projector"]
