@@ -142,13 +142,13 @@ def against_triangles(sizes):
         print(f"{triangles:9,}   {t / first:.2f}", flush=True)
 
 
-def against_straight(triangles, spp, rounds):
+def against_straight(triangles, depths, spp, rounds):
     """What bending costs in the quotient: renders at twist 1 over renders at twist 0.
 
     Rays end elsewhere at twist 1, so that times are compared over the length that was traced.
     """
     print(f"\nquotient, {triangles:,} triangles: time per traced length, twist 1 : twist 0")
-    for depth in (2, 4, 8):
+    for depth in depths:
         scenes = {twist: bumpy_scene(triangles, twist=twist, max_depth=depth) for twist in (0, 1)}
         lengths = {twist: traced_length(scene) for twist, scene in scenes.items()}
         ratios = []
@@ -206,15 +206,15 @@ def bumpy_sphere(n):
     return mesh
 
 
-def memory():
-    """Peak memory that a render of a million pixels adds, with one sample each."""
-    scene = bent_box(1024)
+def memory(width):
+    """Peak memory that a render adds per million pixels, with one sample each."""
+    scene = bent_box(width)
     mi.render(bent_box(64), spp=1)
     dr.sync_thread()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds(scene, 1, 0)
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    added = (after - before) / 1024 / 1.048576
+    added = (after - before) / 1024 * 1e6 / width**2
     print(f"\npeak memory per million pixels of one sample: {added:.0f} MiB "
           f"(process: {after / 1024:.0f} MiB)")
 
@@ -224,16 +224,16 @@ if __name__ == "__main__":
     parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
     arguments = parser.parse_args()
     if arguments.quick:
-        memory()
+        memory(128)
         first_render()
-        against_path(32, 16, 2)
-        pixels_off(32, 16)
-        against_triangles((1_000, 10_000))
-        against_straight(1_000, 4, 2)
+        against_path(16, 4, 1)
+        pixels_off(16, 4)
+        against_triangles((1_000,))
+        against_straight(1_000, (2,), 1, 1)
     else:
-        memory()
+        memory(1024)
         first_render()
         against_path(128, 256, 5)
         pixels_off(128, 1024)
         against_triangles((1_000, 10_000, 100_000, 1_000_000))
-        against_straight(240_000, 32, 5)
+        against_straight(240_000, (2, 4, 8), 32, 5)

@@ -5,6 +5,7 @@ within one run, because machines are noisy; writing a checkpoint is time on a cl
 """
 
 import argparse
+import math
 import os
 import pathlib
 import statistics
@@ -50,12 +51,13 @@ def overhead(plain, costly, repeats):
     return statistics.median(ratios), min(ratios), max(ratios)
 
 
-def passes(repeats, total, samples):
+def passes(repeats, size, total, samples):
     """A still of so many samples in passes of fewer, against one pass of all."""
     from nil_mitsuba import passes as module
 
-    scene, integrator = load(512, 256)
-    spp = total // (512 * 256)
+    scene, integrator = load(*size)
+    pixels = math.prod(size)
+    spp = total // pixels
 
     def render(still):
         state = still.nothing()
@@ -67,15 +69,15 @@ def passes(repeats, total, samples):
         module.WAVEFRONT_SAMPLES = usual
         return still
 
-    one, many = still_of(spp * 512 * 256), still_of(samples)
-    assert one.count == 1 and many.count * samples == spp * 512 * 256
+    one, many = still_of(spp * pixels), still_of(samples)
+    assert one.count == 1 and many.count * samples == spp * pixels
     return overhead(lambda: render(one), lambda: render(many), repeats)
 
 
-def layers(repeats):
+def layers(repeats, size):
     """A pass with all layers against one with none."""
     def work(names):
-        scene, integrator = load(512, 256, names)
+        scene, integrator = load(*size, names)
         still = stills.Still(scene, 0, integrator, 0, stills.Rules(16), scene_hash="")
         state = still.nothing()
         return lambda: state.plus(still.render(0))
@@ -83,9 +85,9 @@ def layers(repeats):
     return overhead(work(""), work(ALL_LAYERS), repeats)
 
 
-def checkpoints(names):
-    """Seconds to write a checkpoint of 1920 × 1080 pixels, and its size in MiB."""
-    scene, integrator = load(1920, 1080, names)
+def checkpoints(width, height, names):
+    """Seconds to write a checkpoint, and its size in MiB."""
+    scene, integrator = load(width, height, names)
     still = stills.Still(scene, 0, integrator, 0, stills.Rules(1), scene_hash="")
     state = still.nothing()
     with tempfile.TemporaryDirectory(dir=".") as folder:
@@ -131,19 +133,20 @@ def main():
         print(f"  {spp:5d} spp: {peak_memory(spp):.0f} MiB")
     from nil_mitsuba.passes import WAVEFRONT_SAMPLES
 
-    shrink = 16 if arguments.quick else 1
+    shrink, size, film = (1024, (64, 32), (192, 108)) if arguments.quick else (
+        1, (512, 256), (1920, 1080))
     total = 4 * WAVEFRONT_SAMPLES // shrink
     for name, function, *of in (
         ("passes against a single one", passes, total, WAVEFRONT_SAMPLES // shrink),
         ("passes for --time and --noise against a single one", passes, total,
-         max(stills.LOOK_SAMPLES // shrink, 512 * 256)),
+         max(stills.LOOK_SAMPLES // shrink, math.prod(size))),
         ("all layers against none", layers),
     ):
-        median, low, high = function(arguments.repeats, *of)
+        median, low, high = function(arguments.repeats, size, *of)
         print(f"{name}: {median:+.1%} (from {low:+.1%} to {high:+.1%})")
     for what, names in (("no layers", ""), ("all layers", ALL_LAYERS)):
-        seconds, size = checkpoints(names)
-        print(f"a checkpoint a minute, 1920 x 1080 pixels, {what}: "
+        seconds, size = checkpoints(*film, names)
+        print(f"a checkpoint a minute, {film[0]} x {film[1]} pixels, {what}: "
               f"{seconds / stills.CHECKPOINT_SECONDS:.1%} ({seconds:.2f} s, {size:.0f} MiB)")
 
 
