@@ -41,6 +41,10 @@ SETUPS = {
 }
 
 
+# First hits that are known, by setup, twist and width
+EXACT = {}
+
+
 def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
     """Shares of rays that name another surface, away from silhouettes and near them, and the
     largest error across the geodesic of those that do not, in units of its allowance."""
@@ -60,7 +64,11 @@ def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
     dr.eval(hit, found_p, label, cell)
 
     wide = [Array3f64(*(truth.Float64(dr.detach(c)) for c in x)) for x in (p, v)]
-    exact = truth.first_hit(surfaces, *wide, 12.0, twist, quotient)
+    # The same rays, whatever the tolerance
+    if (kind, twist, width) not in EXACT:
+        EXACT[kind, twist, width] = truth.first_hit(surfaces, *wide, 12.0, twist, quotient)
+        dr.eval(EXACT[kind, twist, width])
+    exact = EXACT[kind, twist, width]
     g = Array3i(*(truth.Int32(dr.detach(c)) for c in cell))
     label = truth.Int32(dr.detach(label))
     ours = truth.surface_hash(label, dr.select(label < 0, Array3i(0), g))

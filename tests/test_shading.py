@@ -1,5 +1,6 @@
 """Surfaces in Nil's orthonormal frame: normals, shading frames, and the next ray's start."""
 
+import functools
 import math
 
 import drjit as dr
@@ -50,14 +51,24 @@ def hits(thing, twist, rays=2000):
     hit = tracer.intersect(p, v, Cone(0, 1e-4), tracer.reach(p, v), mi.Bool(True))
     si = surface_interaction(hit, v, space, mi.Color0f())
     straight = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
+    # In one kernel, and not again for each thing that is asked of them
+    dr.eval(hit, si, straight)
     assert dr.count(hit.valid)[0] > rays / 4
     return hit, si, straight, space, scene
 
 
+@pytest.fixture(scope="module")
+def met(tmp_path_factory):
+    """``hits`` by kind of thing, each traced once for all tests."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("things")
+    return functools.cache(lambda kind, *arguments: hits(surfaces(folder)[kind], *arguments))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("twist", [0.0, 1.0, 3.0])
-def test_shading_frame_is_orthonormal_and_as_handed_as_mitsubas(rgb, kind, twist, tmp_path):
-    hit, si, straight, _, _ = hits(surfaces(tmp_path)[kind], twist)
+def test_shading_frame_is_orthonormal_and_as_handed_as_mitsubas(rgb, met, kind, twist):
+    hit, si, straight, _, _ = met(kind, twist)
     s, t, n = si.sh_frame.s, si.sh_frame.t, si.sh_frame.n
     valid = hit.valid
     for a, b, product in ((s, s, 1), (t, t, 1), (n, n, 1), (s, t, 0), (s, n, 0), (t, n, 0)):
@@ -69,9 +80,9 @@ def test_shading_frame_is_orthonormal_and_as_handed_as_mitsubas(rgb, kind, twist
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("twist", [1.0, 3.0])
-def test_normal_is_orthogonal_to_what_the_frame_makes_of_tangents(rgb, kind, twist, tmp_path):
+def test_normal_is_orthogonal_to_what_the_frame_makes_of_tangents(rgb, met, kind, twist):
     """Tangents are those of the straight scene: a normal carried over as a vector would fail."""
-    hit, si, straight, space, _ = hits(surfaces(tmp_path)[kind], twist)
+    hit, si, straight, space, _ = met(kind, twist)
     p = space.to_cells(si.p)
     a, b = dr.normalize(straight.dp_du), dr.normalize(straight.dp_dv)
     a, b = (dr.normalize(x - straight.n * dr.dot(straight.n, x)) for x in (a, b))
@@ -85,8 +96,8 @@ def test_normal_is_orthogonal_to_what_the_frame_makes_of_tangents(rgb, kind, twi
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder", "rectangle"])
-def test_shading_normal_of_a_surface_without_interpolation_is_its_normal(rgb, kind, tmp_path):
-    hit, si, _, _, _ = hits(surfaces(tmp_path)[kind], 2.0)
+def test_shading_normal_of_a_surface_without_interpolation_is_its_normal(rgb, met, kind):
+    hit, si, _, _, _ = met(kind, 3.0)
     assert dr.all(~hit.valid | (dr.norm(si.sh_frame.n - si.n) < 1e-5))
 
 
@@ -110,8 +121,8 @@ def test_normal_is_the_gradient_of_distance_to_the_surface(rgb, twist):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("twist", [0.0, 1.0, 3.0])
-def test_interactions_hold_no_nan(rgb, kind, twist, tmp_path):
-    hit, si, _, _, _ = hits(surfaces(tmp_path)[kind], twist)
+def test_interactions_hold_no_nan(rgb, met, kind, twist):
+    hit, si, _, _, _ = met(kind, twist)
     for name in ("p", "n", "dp_du", "dp_dv", "uv", "wi"):
         for component in getattr(si, name):
             assert dr.all(~hit.valid | dr.isfinite(component)), name
@@ -121,9 +132,9 @@ def test_interactions_hold_no_nan(rgb, kind, twist, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("twist", [0.0, 1.0, 3.0, -2.0])
-def test_hits_are_seen_from_the_side_they_are_hit_from(rgb, kind, twist, tmp_path):
+def test_hits_are_seen_from_the_side_they_are_hit_from(rgb, met, kind, twist):
     """The traced line and the geodesic's direction agree about the side, grazing hits included."""
-    hit, si, straight, _, _ = hits(surfaces(tmp_path)[kind], twist, 200_000)
+    hit, si, straight, _, _ = met(kind, twist, 200_000)
     traced = dr.dot(hit.ray.d, straight.n)
     seen = -dr.dot(si.to_world(si.wi), si.n)
     assert dr.all(~hit.valid | (traced * seen > 0))
