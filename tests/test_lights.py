@@ -260,7 +260,10 @@ def visible(scene, integrator, si, found):
     from nil_mitsuba.tracer import Cone
 
     active = mi.Bool(found.weight[0] > 0) & (dr.dot(si.n, found.direction) > 0)
-    return active & integrator._visible(View(scene, integrator), si, found, Cone(0, 1e-4), active)
+    margin = mi.Float(2e-6)  # of a surface that no shape has
+    return active & integrator._visible(View(scene, integrator), si, margin, found, Cone(0, 1e-4),
+                                        active)
+
 
 @pytest.mark.parametrize("radius", [0.5, 4.0, pytest.param(9.0, marks=pytest.mark.verify)])
 @pytest.mark.parametrize("twist", [1, -1])
