@@ -1,7 +1,7 @@
 """The tracers that are compared, and the first hits of rays by any of them.
 
-A tracer is made by a function of the scene, the space and the longest distance, once a variant is
-set.
+A tracer is made by a function of the scene, the space, the longest distance and the scene's box if
+it is known, once a variant is set.
 """
 
 import math
@@ -25,18 +25,18 @@ def allowance(t, twist):
     return (2e-5 + 2e-6 * t) * math.sqrt(1 + twist**2)
 
 
-def package(scene, space, max_distance):
+def package(scene, space, max_distance, box=None):
     from nil_mitsuba.tracer import Tracer
 
-    return Tracer(scene, space, max_distance)
+    return Tracer(scene, space, max_distance, box)
 
 
 def chords(method, knob):
     """What makes a tracer by a method of ``tracing_methods``, which needs a variant."""
-    def make(scene, space, max_distance):
+    def make(scene, space, max_distance, box=None):
         from .tracing_methods import METHODS, ChordTracer
 
-        return ChordTracer(scene, space, max_distance, METHODS[method], knob)
+        return ChordTracer(scene, space, max_distance, METHODS[method], knob, box)
     return make
 
 

@@ -224,8 +224,8 @@ class ChordTracer(Tracer):
     meets it; the cone that the viewer allows is not used.
     """
 
-    def __init__(self, scene, space, max_distance, method, knob):
-        super().__init__(scene, space, max_distance)
+    def __init__(self, scene, space, max_distance, method, knob, box=None):
+        super().__init__(scene, space, max_distance, box)
         self.method = method(dr.opaque(mi.Float, knob), space.twist)
 
     def intersect(self, p, v, cone, reach, active, time=0):

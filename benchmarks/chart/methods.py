@@ -20,11 +20,11 @@ KNOBS = {
 DEFAULT = mi.load_dict({"type": "nil"}).tolerance
 
 
-def tracer_of(method, knob, scene, space, max_distance=math.inf):
+def tracer_of(method, knob, scene, space, max_distance=math.inf, box=None):
     """A tracer with one setting of the method's knob."""
     if method == PACKAGE:
-        return Tracer(scene, space, max_distance)
-    return ChordTracer(scene, space, max_distance, METHODS[method], knob)
+        return Tracer(scene, space, max_distance, box)
+    return ChordTracer(scene, space, max_distance, METHODS[method], knob, box)
 
 
 def timed(run):
