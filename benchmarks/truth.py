@@ -20,8 +20,9 @@ from drjit.llvm import Array3f64, Array3i, Bool, Float64, Int32, UInt32, UInt64
 STEP = 0.02          # arc length of one step of the scan, in cells; see first_hit()
 ROOT_WIDTH = 1e-12   # arc length to which roots and cell crossings are bracketed
 OVERLAP = 1e-8       # intervals of the scan overlap by this, so that no root falls between two
-FACE = 2e-13         # a ray has left its cell when it is this far outside: above rounding, so that
-                     # a ray along a face does not change cells for ever
+# A ray has left its cell when it is this far outside: above rounding, so that a ray along a face
+# does not change cells for ever
+FACE = 2e-13
 NO_SURFACE = -1      # label of a ray that hits nothing
 
 

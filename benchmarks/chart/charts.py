@@ -122,10 +122,10 @@ def scenes_chart(alt, rows):
         grid.append(alt.hconcat(*line, title=alt.TitleParams(
             ", ".join(scene), orient="left", anchor="middle", fontSize=13)))
     return alt.vconcat(*grid).properties(title=alt.TitleParams(
-        "Position error that 1 % of the hits exceed, and share of rays that name another surface, "
-        "over processor time per ray (µs)", anchor="start", fontSize=14, offset=12,
-        subtitle="Up to so many cells. Diamond: the package's default. Hollow: none seen (drawn at "
-                 "half of one ray)."))
+        "Position error that 1 % of the hits exceed, and share of rays that name another "
+        "surface, over processor time per ray (µs)", anchor="start", fontSize=14, offset=12,
+        subtitle="Up to so many cells. Diamond: the package's default. Hollow: none seen (drawn "
+                 "at half of one ray)."))
 
 
 def image_chart(alt, rows):
@@ -164,8 +164,8 @@ def image_chart(alt, rows):
     counts = ", ".join(str(n) for n in sorted({row["spp"] for row in rows}))
     return alt.vconcat(*grid).properties(title=alt.TitleParams(
         "Error of images over time: lower left is better", anchor="start", fontSize=16,
-        subtitle=f"{counts} samples per pixel, against a converged render. FLIP is a perceptual "
-                 "difference from 0 to 1. Each method with the step or tolerance named.",
+        subtitle=f"{counts} samples per pixel, against a converged render. FLIP is a "
+                 "perceptual difference from 0 to 1. Each method with the step or tolerance named.",
         subtitleFontSize=12, offset=12))
 
 
