@@ -158,8 +158,13 @@ def short_flow(p, v, t, h, twist=1):
     g = _polynomial(y, [(-1)**n * (2*n + 2) / factorial(2*n + 3) for n in range(4)])
     sinc = dr.fma(y, g, c)
     c2 = dr.fma(v.x, v.x, v.y * v.y)
-    middle = _turned(v, *dr.sincos(turn * dr.fma(0.5, h, t)))
+    middle = turned(v, turn * dr.fma(0.5, h, t))
     return _along_helix(p, middle, c2, h, twist, half, half * sinc, c, sinc, g)
+
+
+def turned(v, angle):
+    """The frame direction ``v`` after its geodesic has turned by ``angle`` = k w t."""
+    return _turned(v, *dr.sincos(angle))
 
 
 def _turned(v, s, c):

@@ -6,7 +6,7 @@ import math
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.python.ad.integrators.common import ADIntegrator
+from mitsuba.python.ad.integrators.common import ADIntegrator, mis_weight
 
 from . import geometry, parameters
 from .camera import Camera
@@ -296,13 +296,6 @@ class NilIntegrator(ADIntegrator):
                                    cone.width)
             spent = dr.select(active, spent + hit.distance, spent)
         return p, v, cone, spent
-
-
-def mis_weight(pdf_a, pdf_b):
-    """Weight of a sample from density ``pdf_a`` by the power heuristic; 0 where both are 0."""
-    a2 = dr.square(pdf_a)
-    w = a2 / dr.fma(pdf_b, pdf_b, a2)
-    return dr.select(dr.isfinite(w), w, 0)
 
 
 def _warn_of_what_is_ignored(shapes, integrator):

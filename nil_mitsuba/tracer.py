@@ -10,6 +10,8 @@ again. Everything in this file is in cell coordinates unless it says "scene".
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -71,19 +73,10 @@ class Hit:
         self.preliminary = preliminary
 
 
-def turned(v: mi.Vector3f, angle: mi.Float) -> mi.Vector3f:
-    """A frame direction after its geodesic has turned by ``angle`` = k w t."""
-    s, c = dr.sincos(angle)
-    return mi.Vector3f(dr.fma(v.x, c, -v.y * s), dr.fma(v.y, c, v.x * s), v.z)
-
-
-def hash_to_unit(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
-    """A number in [0, 1) from a ray's bits, the same on every machine."""
-    bits = [dr.reinterpret_array(mi.UInt32, x) for x in (v.x, v.y, p.x)]
-    mixed = (bits[0] * 0x9E3779B1) ^ (bits[1] * 0x85EBCA77) ^ (bits[2] * 0xC2B2AE3D)
-    mixed = (mixed ^ (mixed >> 15)) * 0x2C1B3C6D
-    mixed = (mixed ^ (mixed >> 12)) * 0x297A2D39
-    return mi.Float(mixed >> 9) * 2**-23
+def random_of(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
+    """A number in [0, 1) that follows from a ray's bits, the same on every machine."""
+    px, py, vx, vy = (dr.reinterpret_array(mi.UInt32, x) for x in (p.x, p.y, v.x, v.y))
+    return mi.sample_tea_float32(px ^ vx, py ^ vy)
 
 
 def line_ray(o: mi.Point3f, d: mi.Vector3f, time: mi.Float, maxt: mi.Float = dr.inf) -> mi.Ray3f:
@@ -91,6 +84,25 @@ def line_ray(o: mi.Point3f, d: mi.Vector3f, time: mi.Float, maxt: mi.Float = dr.
     ray = dr.zeros(mi.Ray3f)
     ray.o, ray.d, ray.time, ray.maxt = o, d, time, maxt
     return ray
+
+
+@dataclass
+class Piece:
+    """What of a chord lies in one cell.
+
+    ``along`` is the whole chord and ``length`` (cells) its length, ``part`` the fraction of it that
+    is inside, and ``face`` the one through which it ``leaves``, if it does. A ray along it starts
+    at ``o`` (scene), by ``before`` (cells) ahead of the chord, in direction ``d``.
+    """
+
+    along: mi.Vector3f
+    length: mi.Float
+    part: mi.Float
+    leaves: mi.Bool
+    face: mi.Vector3i
+    o: mi.Point3f
+    d: mi.Vector3f
+    before: mi.Float
 
 
 class Bend:
@@ -231,12 +243,11 @@ class Tracer:
         y = turn * v.x
         return mi.Vector3f(-turn * v.y, y, dr.fma(k * p.x, y, k * v.x * v.y))
 
-    def piece(self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float):
-        """What of the chord from ``vertex`` to ``end`` lies in this cell.
+    def piece(self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float
+              ) -> Piece:
+        """What of the chord from ``vertex`` (at arc length t0) to ``end`` lies in this cell.
 
-        Returns the chord; the fraction of it that is inside, whether it leaves and through which
-        face; its length; start (scene) and direction of a ray along it, and how far (cells) that
-        begins before ``vertex``. ``direction`` is taken for that of a chord without length.
+        ``direction`` is taken for that of a chord without length.
         """
         along = mi.Vector3f(end - vertex)
         s_last, leaves, face = mi.Float(1), mi.Bool(False), mi.Vector3i(0)
@@ -252,7 +263,7 @@ class Tracer:
         # Pieces overlap by the rounding of their joint, but none reaches behind the start.
         before = dr.select(t0 > 0, self.space.slack, 0)
         o = self.space.to_scene(vertex - before * d)
-        return along, s_last, leaves, face, speed, o, d, before
+        return Piece(along, speed, s_last, leaves, face, o, d, before)
 
     # ------------------------------------------------------------------ tracing
 
@@ -273,7 +284,7 @@ class Tracer:
         chords = Chords(bend, cone, dr.select(cone.soft, SOFT_SAGITTA, SAGITTA),
                         dr.select(cone.soft, 0, START), self.least)
         # Where chords join differs from ray to ray: edges are off by noise, not by steps.
-        stretch = dr.select(cone.soft, 1, dr.fma(2 / 3, hash_to_unit(p, v), 2 / 3))
+        stretch = dr.select(cone.soft, 1, dr.fma(2 / 3, random_of(p, v), 2 / 3))
 
         # The chord in work runs from ``vertex`` (at arc length t0, on the last chord) to ``end``;
         # ``base`` is the geodesic's point at t1, where it has ``direction``. ``cap`` shortens
@@ -318,38 +329,41 @@ class Tracer:
                 cap = dr.select(fresh & ~redo, 2 * cap, cap)
                 redo = mi.Bool(False)
 
-                along, s_last, leaves, face, speed, o, d, before = self.piece(
-                    vertex, end, direction, t0)
-                ray = line_ray(o, d, time,
-                               dr.fma(s_last, speed, before + space.slack) * space.size)
+                piece = self.piece(vertex, end, direction, t0)
+                last = dr.fma(piece.part, piece.length, piece.before + space.slack)
+                ray = line_ray(piece.o, piece.d, time, last * space.size)
                 found = scene.ray_intersect_preliminary(ray, coherent=False,
                                                         active=searching & (t0 < reach))
                 there = found.is_valid()
-                through = ~there & leaves
+                through = ~there & piece.leaves
                 # Where something was met, the chord stays as it is
-                t0 = dr.select(there, t0, dr.select(leaves, dr.fma(s_last, t1 - t0, t0), t1))
-                vertex = dr.select(there, vertex,
-                                   dr.select(leaves, dr.fma(along, s_last, vertex), end))
+                t0 = dr.select(there, t0, dr.select(through, dr.fma(piece.part, t1 - t0, t0), t1))
+                vertex = dr.select(there, vertex, dr.select(
+                    through, dr.fma(piece.along, piece.part, vertex), end))
                 if quotient:
-                    face = dr.select(through, face, 0)
+                    face = dr.select(through, piece.face, 0)
                     vertex, (end, base), cell = through_face(vertex, [end, base], cell, face, space)
                 searching &= ~there & (t0 < reach)
 
             there = active & found.is_valid()
-            _, _, _, _, speed, o, d, before = self.piece(vertex, end, direction, t0)
-            s = (found.t / space.size - before) / dr.maximum(speed, 1e-20)
+            piece = self.piece(vertex, end, direction, t0)
+            o, d = mi.Point3f(piece.o), mi.Vector3f(piece.d)
+            s = (found.t / space.size - piece.before) / dr.maximum(piece.length, 1e-20)
             distance = dr.select(there, dr.fma(dr.clip(s, 0, 1), t1 - t0, t0), distance)
 
             # ------------- On the geodesic's tangent, where a chord did -------------
             # A step sideways has no sagitta, but its start was off the geodesic.
             sideways = length == 0
             error = dr.select(sideways, dr.inf, bend.across * 0.125 * dr.square(scale))
+            # A 250th of what may be seen: two steps of the tangent reach it, one seldom does
             goal = dr.fma(0.004, dr.fma(cone.spread, distance, cone.width), self.exact)
             # A chord that cannot be cut any more is taken as it is.
             looking = there & ~cone.soft & (error > goal) & (sideways | (scale > self.least))
             # What a step sideways has met stays where the tangent there finds nothing better.
             valid = there & (~looking | sideways)
             at = mi.Float(distance)
+            # A chord's ends are off by its sagitta at most, which is far less than a quarter of
+            # its length; a step sideways comes after a chord of eight caps.
             window = dr.select(sideways, 2 * cap, 0.25 * scale)
             side = mi.Float(0)
             if looking:
@@ -384,6 +398,7 @@ class Tracer:
                 at = dr.select(looking, at + s, at)
                 error = 0.5 * bend.across * dr.square(s)
                 good = looking & (error <= goal)
+                # The error falls by its square: what is 256 of the last one away is something else
                 window = dr.minimum(0.5 * window, 256 * error)
                 valid |= good
                 distance = dr.select(good, at, distance)
@@ -392,12 +407,13 @@ class Tracer:
                 looking &= ~good
 
             redo = there & ~valid
+            # A chord of an eighth has a 64th of the sagitta
             cap = dr.select(redo, 0.125 * scale, cap)
             active = mi.Bool(redo)
 
-        distance = dr.select(valid, distance, dr.inf)
-        return Hit(valid, distance, turned(v, turn * distance), cell,
-                   line_ray(o, d, time), found)
+        arrival = geometry.turned(v, turn * dr.select(valid, distance, 0))
+        return Hit(valid, dr.select(valid, distance, dr.inf), arrival, cell, line_ray(o, d, time),
+                   found)
 
     @dr.syntax
     def occluded(self, p: mi.Point3f, start: mi.Point3f, v: mi.Vector3f, cone: Cone,
@@ -437,17 +453,17 @@ class Tracer:
             corner = dr.fma(dr.select(last, 0, -lift), self.acceleration(base, direction), base)
             end = dr.select(fresh, corner, end)
 
-            along, s_last, leaves, face, speed, o, d, before = self.piece(
-                vertex, end, direction, t0)
-            after = dr.select(leaves | ~last, space.slack, 0)
-            ray = line_ray(o, d, time, dr.fma(s_last, speed, before + after) * space.size)
+            piece = self.piece(vertex, end, direction, t0)
+            after = dr.select(piece.leaves | ~last, space.slack, 0)
+            ray = line_ray(piece.o, piece.d, time, space.size * dr.fma(
+                piece.part, piece.length, piece.before + after))
             hit = scene.ray_test(ray, coherent=False, active=active & (t0 < reach))
 
             blocked |= hit
-            t0 = dr.select(leaves, dr.fma(s_last, t1 - t0, t0), t1)
-            vertex = dr.select(leaves, dr.fma(along, s_last, vertex), end)
+            t0 = dr.select(piece.leaves, dr.fma(piece.part, t1 - t0, t0), t1)
+            vertex = dr.select(piece.leaves, dr.fma(piece.along, piece.part, vertex), end)
             if quotient:
-                face = dr.select(leaves, face, 0)
+                face = dr.select(piece.leaves, piece.face, 0)
                 vertex, (end, base), _ = through_face(vertex, [end, base], mi.Vector3i(0), face,
                                                       space)
             active &= ~hit & (t0 < reach)

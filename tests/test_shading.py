@@ -143,7 +143,7 @@ def test_hits_are_seen_from_the_side_they_are_hit_from(rgb, met, kind, twist):
 @pytest.mark.parametrize("twist", [0.0, 1.0, 3.0])
 @pytest.mark.parametrize("cell", [(0.0, 1.0), (-5.0, 10.0), (0.3, 0.1)])
 def test_offset_leaves_the_surface_on_the_side_of_the_direction(rgb, twist, cell):
-    """On both sides, in units of the surface's own distance, by more than float32 rounding."""
+    """By the margin, along the surface's Euclidean normal, but for the rounding of coordinates."""
     from nil_mitsuba.interaction import offset, unit_conormal
     from nil_mitsuba.quotient import Space
 
@@ -156,11 +156,10 @@ def test_offset_leaves_the_surface_on_the_side_of_the_direction(rgb, twist, cell
     for side in (1, -1):
         towards = dr.normalize(mi.Vector3f(dr.sin(13 * i), dr.cos(17 * i), dr.sin(19 * i)))
         towards = dr.mulsign(towards, dr.dot(towards, conormal)) * side
-        start = space.to_scene(offset(p, conormal, towards, space))
-        height = dr.dot(start - p, n) * side
-        scale = 1 + dr.max(dr.abs(p))
-        assert dr.all(height > 2e-6 * scale)
-        assert dr.all(dr.norm(start - p) < 2e-3 * scale)
+        start = space.to_scene(offset(p, conormal, towards, mi.Float(1e-3), space))
+        rounding = 2**-22 * (max(map(abs, cell)) + dr.max(dr.abs(p)))
+        assert dr.all(dr.abs(dr.dot(start - p, n) * side - 1e-3) < rounding)
+        assert dr.all(dr.norm(start - p) < 1e-3 + 2 * rounding)
 
 
 # ------------------------------------------------------------------ emission
