@@ -19,7 +19,9 @@ from .sums import Sums, name_passes
 
 # The number is that of the format. JSON text follows, with its length before it, then the arrays
 # in the order in which it lists them, and the SHA-256 of all that.
-MAGIC = b"nil-mitsuba sums 1\n\0\0\0\0\0"
+MAGIC = b"nil-mitsuba sums 2\n\0\0\0\0\0"
+# Until then wavefronts had seeds, and not samples: their passes are no others of the same picture.
+OTHER_NUMBERS = b"nil-mitsuba sums 1\n"
 ALIGNMENT = 64  # bytes; arrays are read where they lie
 ARRAYS = {"values": "d", "moments": "d", "points": "i"}  # fields of Sums and their item types
 
@@ -142,6 +144,9 @@ def _read(path) -> bytes:
 
 def _header(data: bytes, name: str) -> tuple[dict, int]:
     """The JSON text of a file, and where its arrays start."""
+    if data.startswith(OTHER_NUMBERS):
+        raise ValueError(f"{name} was rendered with other random numbers, by an earlier version of "
+                         "nil-mitsuba: only that version can go on with it.")
     if not data.startswith(MAGIC):
         raise ValueError(f"{name} is no checkpoint of this version of nil-mitsuba.")
     if len(data) > len(MAGIC) + 8 + 32:

@@ -7,6 +7,7 @@ machine, and their sums added up. Layers come from the first vertices of the sam
 from __future__ import annotations
 
 import math
+from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +18,23 @@ from .errors import raising_causes
 from .layers import LAYERS, channel_names
 from .sums import Sums, develop, luminance
 
-# Camera samples in one wavefront: more use no processor better, and memory grows with them.
+# Camera samples in one pass (or one per pixel), and in one wavefront, which is what is traced at
+# once: more use no processor better, and memory grows with them.
 WAVEFRONT_SAMPLES = 2**21
+
+# Nothing interrupts a wavefront, so it should take about so many seconds. To record the next one
+# takes one processor 0.02 to 0.05 s meanwhile: three percent of two. The first is small, and they
+# grow by this factor at most, since one part of a picture may cost much more than another.
+WAVEFRONT_SECONDS = 1.0
+FIRST_SAMPLES = 2**16
+GROWTH = 16
+# They are multiples of this. No pixel with a power of two of samples is cut, so that its sum under
+# a box filter is the same bit by bit.
+STEP_SAMPLES = 2**12
+
+# Samplers other than "independent" seed a wavefront as a whole: where it is cut shows in the
+# picture. Such a tile holds about so many samples, whatever time they take.
+TILE_SAMPLES = 2**19
 
 NO_PIXEL = 2**32 - 1  # number of a pixel outside of the crop
 
@@ -29,7 +45,8 @@ class Passes:
     ``spp`` is the number of samples per pixel in each pass, ``count`` the number of passes that
     hold at least the samples asked for. Both follow from the scene and the settings alone.
     A pass holds as many samples as fit into `WAVEFRONT_SAMPLES`, or ``pass_spp`` per pixel if that
-    is less, but at least one per pixel; larger images are rendered in bands.
+    is less, but at least one per pixel. It is rendered in wavefronts; with the sampler
+    "independent" each sample has a seed of its own, so that it does not matter where they are cut.
     """
 
     def __init__(self, integrator, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0,
@@ -44,22 +61,37 @@ class Passes:
         if self.film.sample_border():
             self.size += 2 * self.film.rfilter().border_size()
         pixels = dr.prod(self.size)
-        self.bands = max(1, math.ceil(pixels / WAVEFRONT_SAMPLES))
-        self.band = math.ceil(pixels / self.bands)   # Pixels of a band
 
-        wanted = spp or self.sensor.sampler().sample_count()
+        self.sampler = self.sensor.sampler().clone()
+        self.own_seeds = self.sampler.class_name() == "IndependentSampler"
+        wanted = spp or self.sampler.sample_count()
         fits = max(1, WAVEFRONT_SAMPLES // pixels)
+        if not self.own_seeds:
+            fits = min(fits, TILE_SAMPLES)           # A pixel's samples are in the same tile
         if pass_spp is None:
             pass_spp = math.ceil(wanted / math.ceil(wanted / fits))
-        self.sampler = self.sensor.sampler().clone()
         self.sampler.set_sample_count(min(pass_spp, fits))
         self.spp = self.sampler.sample_count()       # Some samplers round it up
         self.sampler.set_samples_per_wavefront(self.spp)
         self.count = math.ceil(wanted / self.spp)
+        self.samples = pixels * self.spp             # Of a pass
+
+        self.wavefront = FIRST_SAMPLES               # Samples in the next one
+        self.begun, self.done = 0.0, 0               # When the pass in work began, and its samples
+        if not self.own_seeds:
+            self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
+            self.wavefront = math.ceil(pixels / self.tiles) * self.spp
 
         self.view = integrator.view(scene)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
         self.film.prepare(channel_names(self.layers, "mean"))
+
+    @property
+    def left(self) -> float | None:
+        """Estimated seconds until the pass that is being rendered is done; None if unknown."""
+        if not 0 < self.done < self.samples:
+            return None
+        return (perf_counter() - self.begun) * (self.samples / self.done - 1)
 
     def nothing(self) -> Sums:
         """The sums of no passes."""
@@ -73,7 +105,7 @@ class Passes:
 
     @raising_causes
     def render(self, index: int) -> Sums:
-        """Render pass number ``index``, whose first seed is `pass_seed`."""
+        """Render pass number ``index``."""
         with dr.suspend_grad():
             block = self.film.create_block()
             # As Mitsuba does: samples of one pixel are summed up before they reach the film
@@ -81,8 +113,7 @@ class Passes:
             crop = self.film.crop_size()
             depth = len(channel_names(self.layers, "first"))
             points = dr.zeros(mi.Int32, crop.y * crop.x * depth)
-            for band in range(self.bands):
-                self._render_band(block, points, index * self.bands + band, band * self.band)
+            self._render_wavefronts(block, points, index)
             # Double precision only while they are added: a third of the memory
             values = block.tensor()
             return Sums(mi.TensorXd(values), self._moments(values),
@@ -102,42 +133,74 @@ class Passes:
             dr.concat([dr.square(total), total * weight, dr.square(weight)]), (3, crop.y, crop.x)
         )
 
-    def _render_band(self, block, points, index, first):
+    def _render_wavefronts(self, block, points, index):
+        # Added to `block`; the layers of a pixel's first sample to `points`
+        self.begun, self.done, lanes = perf_counter(), 0, 0
+        start = self.begun
+        try:
+            while self.done + lanes < self.samples:
+                # Recorded while the one before it is traced, but not begun
+                add, lanes_of_next = self._record(index, self.done + lanes)
+                self._finish(lanes, start)
+                start, lanes = perf_counter(), lanes_of_next
+                add(block, points)
+                del add  # what it has needs not be kept
+                # Together: what is evaluated later would be traced again
+                dr.eval(block.tensor(), points)
+            self._finish(lanes, start)
+        except BaseException:
+            # Nothing that was scattered or begun outlives the scene
+            dr.eval()
+            dr.sync_thread()
+            raise
+
+    def _finish(self, lanes, start):
+        # Wait for the wavefront in work, and choose the size of those to come
+        dr.sync_thread()
+        self.done += lanes
+        if self.own_seeds and lanes:
+            wanted = lanes * WAVEFRONT_SECONDS / (perf_counter() - start)
+            steps = int(min(wanted, lanes * GROWTH, WAVEFRONT_SAMPLES) / STEP_SAMPLES)
+            self.wavefront = max(1, steps) * STEP_SAMPLES
+
+    def _record(self, index, first):
+        """Trace the samples from number ``first`` on; returns what adds them up, and how many."""
+        # Opaque, so that one kernel does for all passes and wavefronts
+        spp = dr.opaque(mi.UInt32, self.spp)
+        lanes = self.wavefront
+        if self.own_seeds:
+            left = self.samples - first
+            steps = math.ceil(left / math.ceil(left / lanes) / STEP_SAMPLES)  # no small rest
+            lanes = max(2, min(steps * STEP_SAMPLES, left))  # a single one is another kernel
+        sample = dr.arange(mi.UInt32, lanes) + dr.opaque(mi.UInt32, first)
         sampler = self.sampler.clone()
-        # Opaque, so that one kernel does for all passes and bands
-        sampler.seed(dr.opaque(mi.UInt32, pass_seed(self.seed, index)), self.band * self.spp)
-        number, inside, ray, weight, position, across = self._sample_rays(sampler, first)
+        if self.own_seeds:
+            sampler.seed(sample_seeds(self.seed, index, sample), 1)
+        else:
+            tile = index * self.tiles + first // lanes
+            sampler.seed(dr.opaque(mi.UInt32, pass_seed(self.seed, tile)), lanes)
+        number, inside, ray, weight, position, across = self._sample_rays(sampler, sample // spp)
         start = self.camera.start(ray, across)
         radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, inside)
-        ADIntegrator._splat_to_block(
-            block, self.film, position,
-            value=dr.select(inside, radiance * weight, 0),
-            weight=dr.select(inside, mi.Float(1), 0),
-            alpha=dr.select(valid & inside, mi.Float(1), 0),
-            aovs=self._channels(seen, "mean"), wavelengths=ray.wavelengths,
-        )
-        channels = self._channels(seen, "first")
-        del sampler, ray, weight, position, across, start, radiance, valid, seen, inside
-        # Together: what is evaluated later would be traced again
-        dr.eval(block.tensor(), [number, *channels] if channels else [])
-        if channels:
-            self._scatter_first(points, number, channels)
-        dr.sync_thread()
 
-    def _scatter_first(self, points, number, channels):
-        """Give each pixel the channels of its first sample."""
-        sample = dr.arange(mi.UInt32, self.band) * dr.opaque(mi.UInt32, self.spp)
-        number = dr.gather(mi.UInt32, number, sample)
-        for i, channel in enumerate(channels):
-            dr.scatter(points, dr.gather(mi.Int32, channel, sample), number * len(channels) + i,
-                       number != NO_PIXEL)
-        dr.eval(points)
+        def add(block, points):
+            ADIntegrator._splat_to_block(
+                block, self.film, position,
+                value=dr.select(inside, radiance * weight, 0),
+                weight=dr.select(inside, mi.Float(1), 0),
+                alpha=dr.select(valid & inside, mi.Float(1), 0),
+                aovs=self._channels(seen, "mean"), wavelengths=ray.wavelengths,
+            )
+            channels = self._channels(seen, "first")
+            if channels:  # in one scatter: a second one would have the paths of the first traced
+                dr.scatter(points, mi.ArrayXi(channels), number,
+                           (number != NO_PIXEL) & (sample % spp == 0))
 
-    def _sample_rays(self, sampler, first):
-        """Camera rays of the pixels from number ``first`` on, as `ADIntegrator.sample_rays`."""
+        return add, lanes
+
+    def _sample_rays(self, sampler, pixel):
+        """Camera rays of the pixels with these numbers, as `ADIntegrator.sample_rays`."""
         film, sensor = self.film, self.sensor
-        index = dr.arange(mi.UInt32, self.band * self.spp)
-        pixel = index // dr.opaque(mi.UInt32, self.spp) + dr.opaque(mi.UInt32, first)
         inside = pixel < dr.prod(self.size)
         place = mi.Vector2i(pixel % self.size.x, pixel // self.size.x)
         if film.sample_border():
@@ -165,6 +228,15 @@ class Passes:
     def _channels(self, seen, rule):
         return [channel for layer in self.layers if LAYERS[layer].rule == rule
                 for channel in seen[layer]]
+
+
+def sample_seeds(seed: int, index: int, sample: mi.UInt32) -> mi.UInt32:
+    """Seeds of the samples with these numbers in pass number ``index``.
+
+    They are hashed. Two samples of 2³² share a seed by chance, as those of any two renders may:
+    where such a pair lies follows no pattern.
+    """
+    return mi.sample_tea_32(sample, dr.opaque(mi.UInt32, pass_seed(seed, index)))[0]
 
 
 def pass_seed(seed: int, index: int) -> int:
