@@ -26,6 +26,7 @@ from .errors import cause_of
 from .layers import GUIDES
 from .output import Output, metadata_of, software
 from .registration import refusal
+from .signals import Watch
 from .sums import name_passes
 
 SUMS = ".sums"  # suffix of checkpoints and parts
@@ -324,24 +325,33 @@ def main() -> None:
 
     The status is 2 for a wrong command line, 130 after Ctrl-C, 143 after SIGTERM and 1 otherwise.
     """
-    verbose = 0
+    with Watch("interrupted, no picture was written.") as watch:
+        sentence, status = _run(watch)
+        with contextlib.suppress(KeyboardInterrupt):
+            dr.sync_thread()  # a kernel that is left would keep the process, and no one watch it
+    if sentence:
+        click.echo(sentence, err=True)
+    sys.exit(status)
+
+
+def _run(watch: Watch) -> tuple[str, int]:
+    """What is to be said in the end, and the status."""
     try:
-        sys.exit(cli.main(prog_name="nil-mitsuba", standalone_mode=False))
+        return "", cli.main(prog_name="nil-mitsuba", standalone_mode=False, obj=watch) or 0
     except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
-        sys.exit(error.exit_code)
+        return error.format_message(), error.exit_code
     except click.ClickException as error:
         sentence, status = error.format_message(), error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        sentence, status = "interrupted, no picture was written.", 130
+    except (click.Abort, KeyboardInterrupt) as error:
+        numbers = (error.__cause__ or error).args  # click's error has what it is made of as cause
+        sentence, status = watch.farewell(), 128 + next(iter(numbers), signal.SIGINT)
     except Exception as error:
         cause = cause_of(error)
         verbose = sum(arg.count("v") for arg in sys.argv if re.fullmatch("-v+", arg))
         if verbose > 1:
             raise
         sentence, status = tidy(str(cause) or type(cause).__name__), 1
-    click.echo(f"nil-mitsuba: {sentence}", err=True)
-    sys.exit(status)
+    return f"nil-mitsuba: {sentence}", status
 
 
 def tidy(text: str) -> str:
@@ -433,7 +443,14 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
                                options.workers or 1, options.threads,
                                lambda sentence: note(tidy(sentence)))
     saver = stills.Saver(sums_path, _note)  # what it says is an error, though not the end
-    with contextlib.closing(parts), _Bar(still, options.quiet) as bar:
+    watch = click.get_current_context().find_object(Watch)
+    assert watch, "as main hands it over"
+    watch.farewell = functools.partial(_farewell, sums_path)
+    with contextlib.ExitStack() as stack:
+        if not (options.clustered or options.quiet):  # a cluster is not waited for
+            stack.enter_context(watch.explaining(functools.partial(_finishing, still)))
+        stack.enter_context(contextlib.closing(parts))
+        bar = stack.enter_context(_Bar(still, options.quiet))
         state, number = still.accumulate(state, parts, bar, saver)
     if not state.sums.count:
         raise Stopped("interrupted before the first pass, nothing was written.", number or 0)
@@ -499,6 +516,18 @@ def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
     paths.output(options, ()).write(picture, metadata)
     for path in paths.pictures:
         options.tell(path)
+
+
+def _finishing(still: stills.Still) -> str:
+    left, about = still.passes.left, ""
+    if left is not None:
+        about = f", in about {left:.0f} s" if left < 120 else f", in about {left / 60:.0f} min"
+    return f"finishing the pass that is being rendered{about}; a second signal ends this at once."
+
+
+def _farewell(sums_path: Path) -> str:
+    there = f'; the same command with --resume goes on from "{sums_path}"'
+    return f"interrupted, no picture was written{there if sums_path.exists() else ''}."
 
 
 class _Bar:

@@ -10,6 +10,9 @@ from pathlib import Path
 STEM_LENGTH = 40  # characters; 160 bytes in UTF-8 at most, and file systems allow names of 255
 
 
+_parts: set[Path] = set()  # that are being written
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[str]:
     """The name of a file to write, which takes the place of `path` when all has gone well.
@@ -24,6 +27,7 @@ def replacing(path: str | os.PathLike) -> Iterator[str]:
         raise OSError(f'cannot write "{path}": it is {what}.')
     # Part of the name is enough, since a longer one might be too long
     part = target.with_name(f".{target.stem[:STEM_LENGTH]}.{os.getpid()}{target.suffix}")
+    _parts.add(part)
     try:
         part.touch()  # some writers cannot tell why they fail to open a file
         yield str(part)
@@ -34,6 +38,14 @@ def replacing(path: str | os.PathLike) -> Iterator[str]:
     except OSError as error:
         raise OSError(f'cannot write "{path}": {error.strerror or error}.') from error
     finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        _parts.discard(part)
+
+
+def abandon() -> None:
+    """Remove what is being written, before the process is ended in the middle of it."""
+    for part in tuple(_parts):
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
 

@@ -359,7 +359,7 @@ def interruption(patience: int = 1) -> Iterator[list[int]]:
     def catch(number, _frame):
         caught.append(number)
         if len(caught) > patience:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(signal.Signals(number))
 
     before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
