@@ -326,6 +326,11 @@ class View:
     """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
 
     def __init__(self, scene: mi.Scene, integrator: NilIntegrator):
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError(
+                'the integrator "nil" takes numbers from the scene that a frozen function would '
+                "keep when the scene changes: render without dr.freeze."
+            )
         self.scene = scene
         self.space = Space(integrator.twist, integrator.quotient, list(integrator.cell_origin),
                            integrator.cell_size)
