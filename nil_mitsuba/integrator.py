@@ -90,7 +90,7 @@ class NilIntegrator(ADIntegrator):
     def view(self, scene: mi.Scene) -> View:
         """The scene as this integrator's parameters show it."""
         view = View(scene, self)
-        _warn_of_what_is_ignored(view.shapes, self)
+        _warn_of_what_is_ignored(scene, view.shapes, self)
         return view
 
     def aov_names(self) -> list[str]:
@@ -298,7 +298,7 @@ class NilIntegrator(ADIntegrator):
         return p, v, cone, spent
 
 
-def _warn_of_what_is_ignored(shapes, integrator):
+def _warn_of_what_is_ignored(scene, shapes, integrator):
     """Log one warning each for shapes outside the quotient's cube, for what of them lies nowhere,
     and for media."""
     lower = list(integrator.cell_origin)
@@ -320,6 +320,11 @@ def _warn_of_what_is_ignored(shapes, integrator):
         if shape.is_medium_transition():
             mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is "
                                      "ignored.")
+    for kind, endpoints in (("sensor", scene.sensors()), ("emitter", scene.emitters())):
+        for endpoint in endpoints:
+            if endpoint.get_medium() is not None:
+                name = f'"{endpoint.id()}"' if endpoint.id() else endpoint.class_name()
+                mi.Log(mi.LogLevel.Warn, f"nil: the medium of the {kind} {name} is ignored.")
 
 
 class View:

@@ -44,6 +44,14 @@ def test_a_mesh_of_many_files_has_a_name_that_one_can_read(rgb, tmp_path):
     assert len(name_of(merged)) < 100 and name_of(merged).startswith('Mesh "one.obj + one.obj')
 
 
+def test_a_warning_names_the_sensor_whose_medium_is_ignored(rgb, capfd):
+    fog = {"type": "homogeneous", "sigma_t": 1.0}
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "camera": {
+        "type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}, "fog": fog}})
+    mi.render(scene, integrator=mi.load_dict({"type": "nil"}), spp=1)
+    assert 'nil: the medium of the sensor "camera" is ignored.' in capfd.readouterr().out
+
+
 @pytest.mark.parametrize("medium", [False, True])
 def test_a_warning_names_a_shape_without_an_id(rgb, tmp_path, capfd, medium):
     inside = '<medium type="homogeneous" name="interior"/>' if medium else ""
