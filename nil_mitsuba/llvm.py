@@ -8,6 +8,7 @@ the GPU of variants that compile for one.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import glob
 import importlib.abc
@@ -36,7 +37,6 @@ SYSTEM_FOLDERS = (
     "/usr/local/lib*",
     os.path.join(sys.prefix, "lib"),
 )
-
 
 
 class Gpu(NamedTuple):
@@ -114,11 +114,24 @@ def require_gpu(variant: str) -> None:
     import drjit as dr
 
     backend, _, rest = variant.partition("_")
-    if backend in GPUS and not dr.has_backend(getattr(dr.JitBackend, GPUS[backend].name)):
+    # Dr.Jit may look for a GPU only later: where there is a driver, it is left to judge for itself
+    if backend in GPUS and not (dr.has_backend(getattr(dr.JitBackend, GPUS[backend].name))
+                                or _has_driver(backend)):
         raise ImportError(
             f'the variant "{variant}" needs {GPUS[backend].needs}, and Dr.Jit finds none here: '
             f'use "llvm_{rest}", which needs none.'
         )
+
+
+def _has_driver(backend: str) -> bool:
+    if backend == "metal":
+        return sys.platform == "darwin"
+    names = (os.environ.get("DRJIT_LIBCUDA_PATH"), "libcuda.so.1", "libcuda.so", "nvcuda.dll")
+    for name in filter(None, names):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(name)
+            return True
+    return False
 
 
 class Guard(importlib.abc.MetaPathFinder):
