@@ -249,11 +249,14 @@ class Lights:
         pointers = list(dr.reinterpret_array(mi.UInt32, self.scene.emitters_dr()))
         densities = [0.0] * (max(pointers) + 1)
         margins = [0.0] * len(emitters)
+        # As the scene knows them: an emitter's own shape may not tell that it is a mesh
+        shapes = {dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter()))[0]: shape
+                  for shape in self.scene.shapes() if shape.is_emitter()}
         textures = [-1] * len(densities)
         for i, (emitter, name, pointer) in enumerate(zip(emitters, names, pointers)):
             if name != "AreaLight":
                 continue
-            margins[i] = margin_on(emitter.get_shape())
+            margins[i] = margin_on(shapes.get(pointer))
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
                 textures[pointer] = len(self.textures)
                 self.textures.append(_radiance_texture(emitter))
