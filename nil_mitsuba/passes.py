@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from time import perf_counter
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -23,11 +24,13 @@ from .sums import Sums, develop, luminance
 WAVEFRONT_SAMPLES = 2**21
 
 # Nothing interrupts a wavefront, so it should take about so many seconds. To record the next one
-# takes one processor 0.02 to 0.05 s meanwhile: three percent of two. The first is small, and they
-# grow by this factor at most, since one part of a picture may cost much more than another.
+# takes one processor 0.02 to 0.05 s meanwhile: three percent of two. An integrator's first is
+# small, and they grow by this factor at most, since one part of a picture may cost much more than
+# another. The renders that come after begin at the pace that it had.
 WAVEFRONT_SECONDS = 1.0
 FIRST_SAMPLES = 2**16
 GROWTH = 16
+_paces: WeakKeyDictionary = WeakKeyDictionary()  # seconds a sample, by integrator
 # They are multiples of this. No pixel with a power of two of samples is cut, so that its sum under
 # a box filter is the same bit by bit.
 STEP_SAMPLES = 2**12
@@ -76,7 +79,8 @@ class Passes:
         self.count = math.ceil(wanted / self.spp)
         self.samples = pixels * self.spp             # Of a pass
 
-        self.wavefront = FIRST_SAMPLES               # Samples in the next one
+        pace = _paces.get(integrator)
+        self.wavefront = samples_in_time(pace) if pace else FIRST_SAMPLES  # in the next one
         self.begun, self.done = 0.0, 0               # When the pass in work began, and its samples
         if not self.own_seeds:
             self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
@@ -159,9 +163,12 @@ class Passes:
         dr.sync_thread()
         self.done += lanes
         if self.own_seeds and lanes:
-            wanted = lanes * WAVEFRONT_SECONDS / (perf_counter() - start)
-            steps = int(min(wanted, lanes * GROWTH, WAVEFRONT_SAMPLES) / STEP_SAMPLES)
-            self.wavefront = max(1, steps) * STEP_SAMPLES
+            pace = (perf_counter() - start) / lanes
+            if self.integrator in _paces:
+                self.wavefront = min(samples_in_time(pace), lanes * GROWTH)
+                _paces[self.integrator] = pace
+            else:
+                _paces[self.integrator] = 0.0  # the first has been compiled, which is no measure
 
     def _record(self, index, first):
         """Trace the samples from number ``first`` on; returns what adds them up, and how many."""
@@ -170,7 +177,8 @@ class Passes:
         lanes = self.wavefront
         if self.own_seeds:
             left = self.samples - first
-            steps = math.ceil(left / math.ceil(left / lanes) / STEP_SAMPLES)  # no small rest
+            pieces = max(1, round(left / lanes))  # no small rest
+            steps = math.ceil(left / pieces / STEP_SAMPLES)
             lanes = max(2, min(steps * STEP_SAMPLES, left))  # a single one is another kernel
         sample = dr.arange(mi.UInt32, lanes) + dr.opaque(mi.UInt32, first)
         sampler = self.sampler.clone()
@@ -228,6 +236,12 @@ class Passes:
     def _channels(self, seen, rule):
         return [channel for layer in self.layers if LAYERS[layer].rule == rule
                 for channel in seen[layer]]
+
+
+def samples_in_time(pace: float) -> int:
+    """Samples in a wavefront of about `WAVEFRONT_SECONDS`, if each takes ``pace`` seconds."""
+    steps = int(min(WAVEFRONT_SECONDS / pace, WAVEFRONT_SAMPLES) / STEP_SAMPLES)
+    return max(1, steps) * STEP_SAMPLES
 
 
 def sample_seeds(seed: int, index: int, sample: mi.UInt32) -> mi.UInt32:
