@@ -205,9 +205,7 @@ class ClosedForm(Euler):
                         "t": dr.select(crossed, 0, state["t"])}
 
     def between(self, v0, v1, s, t):
-        angle = self.twist * v0.z * t * s
-        sin, cos = dr.sincos(angle)
-        return type(v0)(dr.fma(v0.x, cos, -v0.y * sin), dr.fma(v0.y, cos, v0.x * sin), v0.z)
+        return geometry.turned(v0, self.twist * v0.z * t * s)
 
 
 class PrintedForm(ClosedForm):
@@ -268,11 +266,11 @@ class ChordTracer(Tracer):
             last = length >= reach - t0
             t1 = dr.select(fresh & good, dr.select(last, reach, t0 + length), t1)
 
-            along, s_last, leaves, face, speed, o, d, before = self.piece(
-                vertex, state["p"], v0, t0)
+            piece = self.piece(vertex, state["p"], v0, t0)
             # No piece reaches past the end.
-            after = dr.select(leaves | (t1 < reach), space.slack, 0)
-            ray = line_ray(o, d, time, (s_last * speed + before + after) * space.size)
+            after = dr.select(piece.leaves | (t1 < reach), space.slack, 0)
+            ray = line_ray(piece.o, piece.d, time, space.size * (
+                piece.part * piece.length + piece.before + after))
 
             # --------------------------- What it met ---------------------------
             there = mi.Bool(False)
@@ -281,7 +279,8 @@ class ChordTracer(Tracer):
             else:
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & good)
                 there = pi.valid
-                s = dr.clip((pi.t / space.size - before) / dr.maximum(speed, 1e-20), 0, 1)
+                s = (pi.t / space.size - piece.before) / dr.maximum(piece.length, 1e-20)
+                s = dr.clip(s, 0, 1)
                 t_hit = dr.fma(s, t1 - t0, t0)
                 done = dr.select(h > 0, 1 - (t1 - t_hit) / h, 0)
                 distance = dr.select(there, t_hit, distance)
@@ -291,13 +290,13 @@ class ChordTracer(Tracer):
             valid |= there
 
             # ------------------------------ Go on ------------------------------
-            leaves &= good & ~there
-            s_leave = dr.fma(s_last, t1 - t0, t0)
+            leaves = piece.leaves & good & ~there
+            s_leave = dr.fma(piece.part, t1 - t0, t0)
             t0 = dr.select(good, dr.select(leaves, s_leave, t1), t0)
-            vertex = dr.select(good, dr.select(leaves, dr.fma(along, s_last, vertex), state["p"]),
-                               vertex)
+            vertex = dr.select(good, dr.select(
+                leaves, dr.fma(piece.along, piece.part, vertex), state["p"]), vertex)
             if space.quotient:
-                face = dr.select(leaves, face, 0)
+                face = dr.select(leaves, piece.face, 0)
                 vertex, (moved,), cell = through_face(vertex, [state["p"]], cell, face, space)
                 state = method.behind_face(state | {"p": moved}, leaves)
             active &= ~there & (t0 < reach)

@@ -347,8 +347,7 @@ def _run(watch: Watch) -> tuple[str, int]:
         sentence, status = watch.farewell(), 128 + next(iter(numbers), signal.SIGINT)
     except Exception as error:
         cause = cause_of(error)
-        verbose = sum(arg.count("v") for arg in sys.argv if re.fullmatch("-v+", arg))
-        if verbose > 1:
+        if mi.log_level() <= mi.LogLevel.Debug:  # -vv
             raise
         sentence, status = tidy(str(cause) or type(cause).__name__), 1
     return f"nil-mitsuba: {sentence}", status

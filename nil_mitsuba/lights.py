@@ -9,6 +9,7 @@ Environments and directional lights are direction fields in the frame, read wher
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +34,7 @@ ARRIVAL_ROUNDING = 2**-19
 GRAZING = 1 / 32
 
 
+@dataclass
 class LightSample:
     """Light that may arrive at a vertex.
 
@@ -43,19 +45,13 @@ class LightSample:
     image of it shows the receiver, 0 for ``delta`` light.
     """
 
-    DRJIT_STRUCT = {"direction": mi.Vector3f, "distance": mi.Float, "reach": mi.Float,
-                    "weight": mi.Spectrum,
-                    "pdf": mi.Float, "delta": mi.Bool, "angle": mi.Float}
-
-    def __init__(self, direction=None, distance=None, reach=None, weight=None, pdf=None,
-                 delta=None, angle=None):
-        self.direction = direction
-        self.distance = distance
-        self.reach = reach
-        self.weight = weight
-        self.pdf = pdf
-        self.delta = delta
-        self.angle = angle
+    direction: mi.Vector3f
+    distance: mi.Float
+    reach: mi.Float
+    weight: mi.Spectrum
+    pdf: mi.Float
+    delta: mi.Bool
+    angle: mi.Float
 
 
 def lobe_angle(pdf):

@@ -178,8 +178,9 @@ class Passes:
         if self.own_seeds:
             left = self.samples - first
             pieces = max(1, round(left / lanes))  # no small rest
-            steps = math.ceil(left / pieces / STEP_SAMPLES)
-            lanes = max(2, min(steps * STEP_SAMPLES, left))  # a single one is another kernel
+            steps = max(1, round(left / pieces / STEP_SAMPLES))
+            lanes = left if pieces == 1 else min(steps * STEP_SAMPLES, left)
+            lanes = max(2, lanes)  # a single one is another kernel
         sample = dr.arange(mi.UInt32, lanes) + dr.opaque(mi.UInt32, first)
         sampler = self.sampler.clone()
         if self.own_seeds:

@@ -46,6 +46,7 @@ class Cone:
         self.soft = mi.Bool(soft)
 
 
+@dataclass
 class Hit:
     """The first surface along a geodesic.
 
@@ -54,23 +55,12 @@ class Hit:
     compute its surface interaction.
     """
 
-    DRJIT_STRUCT = {
-        "valid": mi.Bool,
-        "distance": mi.Float,
-        "arrival": mi.Vector3f,
-        "cell": mi.Vector3i,
-        "ray": mi.Ray3f,
-        "preliminary": mi.PreliminaryIntersection3f,
-    }
-
-    def __init__(self, valid=None, distance=None, arrival=None, cell=None, ray=None,
-                 preliminary=None):
-        self.valid = valid
-        self.distance = distance
-        self.arrival = arrival
-        self.cell = cell
-        self.ray = ray
-        self.preliminary = preliminary
+    valid: mi.Bool
+    distance: mi.Float
+    arrival: mi.Vector3f
+    cell: mi.Vector3i
+    ray: mi.Ray3f
+    preliminary: mi.PreliminaryIntersection3f
 
 
 def random_of(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
@@ -108,19 +98,17 @@ class Piece:
 class Bend:
     """How much the geodesic in frame direction ``v`` bends at most, along all of its length.
 
-    ``turn`` bounds the acceleration of x and y, ``across`` that of the point across its direction:
+    ``across`` bounds the acceleration of the point across its direction:
     the acceleration is k (−w b, w a, a b) in frame components, and across the direction its length
     is |k| c √(w² + a² b²) ≤ |k| c √(w² + c⁴/4). ``longest``: beyond 1/k a chord is no parabola.
     """
 
     def __init__(self, v: mi.Vector3f, twist: mi.Float):
-        self.k = dr.maximum(dr.abs(twist), 1e-9)
-        self.c2 = dr.fma(v.x, v.x, v.y * v.y)
-        c = dr.sqrt(self.c2)
-        self.turn = dr.maximum(self.k * dr.abs(v.z) * c, 1e-12)
-        across = self.k * c * dr.sqrt(dr.fma(0.25 * self.c2, self.c2, dr.square(v.z)))
+        k = dr.maximum(dr.abs(twist), 1e-9)
+        c2 = dr.fma(v.x, v.x, v.y * v.y)
+        across = k * dr.sqrt(c2 * dr.fma(0.25 * c2, c2, dr.square(v.z)))
         self.across = dr.maximum(across, 1e-9)
-        self.longest = dr.rcp(self.k)
+        self.longest = dr.rcp(k)
 
 
 class Chords:

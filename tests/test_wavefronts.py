@@ -1,6 +1,7 @@
 """Passes are traced in wavefronts, and the picture does not depend on where they are cut."""
 
 import math
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -55,6 +56,7 @@ def cut(module, monkeypatch):
         monkeypatch.setattr(module, "FIRST_SAMPLES", samples)
         monkeypatch.setattr(module, "STEP_SAMPLES", samples)
         monkeypatch.setattr(module, "GROWTH", 1)
+        monkeypatch.setattr(module, "_paces", WeakKeyDictionary())
         traced.clear()
         return traced
 
@@ -75,10 +77,10 @@ def test_the_picture_is_the_same_wherever_wavefronts_are_cut(rgb, cut, scene):
     loaded = mi.load_dict(description(**scene))
     cut(2**14)
     whole = mi.render(loaded, spp=12, seed=3)
-    for samples in (1000, 64, 63):  # the last also cuts off a single sample
+    for samples in (600, 64, 63):  # the last also cuts off a single sample
         traced = cut(samples)
         image = mi.render(loaded, spp=12, seed=3)
-        assert len(traced) >= 2
+        assert len(traced) >= (2 if samples > 64 else 20)
         assert dr.allclose(image, whole, rtol=1e-5, atol=1e-6)
 
 
@@ -88,7 +90,7 @@ def test_a_single_pixel_is_cut(rgb, cut):
     whole = mi.render(loaded, spp=2**14)
     traced = cut(3000)
     image = mi.render(loaded, spp=2**14)
-    assert len(traced) == 6
+    assert len(traced) == 5
     assert dr.allclose(image, whole, rtol=1e-4)  # 2^14 float32 numbers, added up
 
 
@@ -107,15 +109,19 @@ def test_wavefronts_follow_the_clock(rgb, cut, module, monkeypatch):
     monkeypatch.setattr(module, "GROWTH", 4)
     monkeypatch.setattr(module, "WAVEFRONT_SECONDS", 1e9)
     mi.render(loaded, spp=16)
-    # The second one is cut before anything is known of the first; 3456 are four of 896 and less
-    assert [lanes for _, lanes in traced] == [64, 64, 256, 256, 896, 896, 1664]
+    # The first may be compiled, and is no measure; each is cut before the last one is done
+    assert [lanes for _, lanes in traced][:6] == [64, 64, 64, 256, 256, 1152]
     assert [first for first, _ in traced[1:]] == [first + lanes for first, lanes in traced[:-1]]
 
-    traced.clear()
+    cut(64)
     monkeypatch.setattr(module, "FIRST_SAMPLES", 1024)
     monkeypatch.setattr(module, "WAVEFRONT_SECONDS", 1e-9)
     mi.render(loaded, spp=16)
-    assert [lanes for _, lanes in traced] == [1024, 1024, *32 * [64]]
+    assert [lanes for _, lanes in traced] == [1024, 1024, 1024, *16 * [64]]
+    # The next render begins at the pace of the last
+    traced.clear()
+    mi.render(loaded, spp=16)
+    assert [lanes for _, lanes in traced] == 64 * [64]
 
 
 def test_no_size_of_a_wavefront_compiles_anything(rgb, cut):

@@ -88,8 +88,7 @@ def walk(p, v, steps: UInt32, length: Float, twist: Float, chained: bool):
         p, step = geometry.wrap(p, twist)
         cell = geometry.multiply(cell, step, Int32(twist))
         n += 1
-        s, c = dr.sincos(twist * v.z * length * Float(n))
-        turned = Array3f(dr.fma(v.x, c, -v.y * s), dr.fma(v.y, c, v.x * s), v.z)
+        turned = geometry.turned(v, twist * v.z * length * Float(n))
         direction = ended if chained else turned
     return p, direction, cell
 
