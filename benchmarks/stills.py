@@ -18,9 +18,10 @@ import drjit as dr
 import mitsuba as mi
 
 from nil_mitsuba import checkpoint, stills
+from nil_mitsuba.layers import RENDERED
 
 SCENE = str(pathlib.Path(__file__).parents[1] / "scenes" / "cornell-box.xml")
-ALL_LAYERS = "distance, position, normal, albedo, cell, shape, samples"
+ALL_LAYERS = ", ".join(RENDERED)
 
 
 def load(width, height, layers=""):

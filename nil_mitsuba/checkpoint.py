@@ -20,7 +20,7 @@ from .sums import Sums, name_passes
 # The number is that of the format. JSON text follows, with its length before it, then the arrays
 # in the order in which it lists them, and the SHA-256 of all that.
 MAGIC = b"nil-mitsuba sums 2\n\0\0\0\0\0"
-# Until then wavefronts had seeds, and not samples: their passes are no others of the same picture.
+# Version 1 seeded wavefronts, not samples: its passes and ours do not add up to one picture.
 OTHER_NUMBERS = b"nil-mitsuba sums 1\n"
 ALIGNMENT = 64  # bytes; arrays are read where they lie
 ARRAYS = {"values": "d", "moments": "d", "points": "i"}  # fields of Sums and their item types

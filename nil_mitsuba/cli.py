@@ -23,7 +23,7 @@ import mitsuba as mi
 
 from . import __version__, checkpoint, exr, jobs, png, stills
 from .errors import cause_of
-from .layers import GUIDES
+from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .registration import refusal
 from .signals import Watch
@@ -217,8 +217,8 @@ def picture_options(command):
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
 )
 @picture_options
-@passes_option("--layers", metavar="A,B,…", help="Layers beside the picture: distance, position, "
-              "normal, albedo, cell, shape, samples.")
+@passes_option("--layers", metavar="A,B,…",
+               help=f"Layers beside the picture: {', '.join(RENDERED)}.")
 @click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's, "
               "or with --time or --noise no limit]")
 @passes_option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
@@ -511,7 +511,7 @@ def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
         "software": software(stills.versions()),
     }
     channels = [field.name for field in film.bitmap().struct_()]
-    picture = stills.Picture(channels, image, {}, exr.component_format(film))
+    picture = stills.Picture(channels, image, {}, stills.component_format(film))
     paths.output(options, ()).write(picture, metadata)
     for path in paths.pictures:
         options.tell(path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import struct
 import time
 from collections.abc import Iterable, Mapping
@@ -50,13 +49,6 @@ FIRST = (
     "commandLine", "scene", "sceneHash", "spp", "seed", "passes", "renderTime", "capDate",
     "utcOffset", "software", "variant",
 )  # fmt: skip
-
-
-def component_format(film: mi.Film) -> str:
-    """The type in which a film wants its pixels stored: one of ``COMPONENT_FORMATS``."""
-    # A film tells it nowhere but in its description.
-    match = re.search(r"component_format = (\w+)", str(film))
-    return match[1] if match else "float32"
 
 
 def write(
@@ -236,8 +228,8 @@ def _describe(header: dict[str, exr_header.Attribute]) -> str:
 def _size(header: dict[str, exr_header.Attribute]) -> str:
     left, top, right, bottom = header["dataWindow"].value
     number = header["compression"].value
-    known = number < len(exr_header.COMPRESSIONS)
-    compression = exr_header.COMPRESSIONS[number] if known else str(number)
+    known = number < len(exr_header.COMPRESSION_NAMES)
+    compression = exr_header.COMPRESSION_NAMES[number] if known else str(number)
     words = [f"{right - left + 1} x {bottom - top + 1} pixels", f"compression {compression}"]
     if "name" in header:
         words.insert(0, f'part "{header["name"].value}"')

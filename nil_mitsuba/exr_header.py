@@ -21,7 +21,7 @@ REQUIRED = {
     "displayWindow": "box2i",
 }  # fmt: skip
 
-COMPRESSIONS = (
+COMPRESSION_NAMES = (  # by their number in a file
     "none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab",
 )  # fmt: skip
 PIXEL_TYPES = ("uint32", "float16", "float32")

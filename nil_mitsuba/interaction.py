@@ -72,6 +72,6 @@ def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, margin: mi.Float, spac
     metric dual of ``n`` would lead through walls that meet this one at a right angle.
     """
     cells = space.to_cells(p)
-    normal = mi.Vector3f(n.x, dr.fma(-space.twist * cells.x, n.z, n.y), n.z)
+    normal = mi.Vector3f(geometry.conormal(cells, n, -space.twist))
     normal = dr.mulsign(dr.normalize(normal), dr.dot(n, d))
     return cells + mi.Point3f(normal) * (margin / space.size)

@@ -21,7 +21,8 @@ from .tracer import Hit
 
 # Emitters that have a meaning in Nil, by the name of their class. (Mitsuba itself samples no
 # directionalarea light and gives it no radiance: in a path tracer it is dark, here too.)
-AREA = ("AreaLight", "DirectionalArea")
+AREA = ("AreaLight",)
+DARK = ("DirectionalArea",)
 POINT = ("PointLight", "SpotLight", "Projector")
 DIRECTIONAL = ("DirectionalEmitter",)
 ENVIRONMENT = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter", "SunskyEmitter",
@@ -38,15 +39,14 @@ GRAZING = 1 / 32
 class LightSample:
     """Light that may arrive at a vertex.
 
-    ``direction``: frame direction of the geodesic towards the light; ``distance`` (cells) along it,
-    infinite for directional light, and ``reach``, before which nothing may stand in the way;
-    ``weight``: radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta``
-    light, which no other technique finds; ``angle``: half angle (radians) of the light that this
-    image of it shows the receiver, 0 for ``delta`` light.
+    ``direction``: frame direction of the geodesic towards the light; ``reach``: length (cells)
+    along it on which nothing may stand in the way, infinite for directional light; ``weight``:
+    radiance over probability; ``pdf``: with respect to solid angle, 0 for ``delta`` light, which no
+    other technique finds; ``angle``: half angle (radians) of the light that this image of it shows
+    the receiver, 0 for ``delta`` light.
     """
 
     direction: mi.Vector3f
-    distance: mi.Float
     reach: mi.Float
     weight: mi.Spectrum
     pdf: mi.Float
@@ -199,13 +199,13 @@ class Lights:
         emitters = scene.emitters()
         names = [emitter.class_name() for emitter in emitters]
         for emitter, name in zip(emitters, names):
-            if name not in AREA + POINT + DIRECTIONAL + ENVIRONMENT:
+            if name not in AREA + DARK + POINT + DIRECTIONAL + ENVIRONMENT:
                 raise RuntimeError(
                     f'the integrator "nil" has no meaning for the emitter "{name}"'
                     f'{f" ({emitter.id()})" if emitter.id() else ""}: use area, point, spot, '
                     "projector, directional, constant, envmap or sunsky."
                 )
-        self.has_area = "AreaLight" in names
+        self.has_area = any(name in AREA for name in names)
         self.has_point = any(name in POINT for name in names)
         self.has_infinite = any(name in DIRECTIONAL + ENVIRONMENT for name in names)
         self.exist = self.has_area or self.has_point or self.has_infinite
@@ -250,7 +250,7 @@ class Lights:
                   for shape in self.scene.shapes() if shape.is_emitter()}
         textures = [-1] * len(densities)
         for i, (emitter, name, pointer) in enumerate(zip(emitters, names, pointers)):
-            if name != "AreaLight":
+            if name not in AREA:
                 continue
             margins[i] = margin_on(shapes.get(pointer))
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
@@ -268,7 +268,7 @@ class Lights:
         those point, as points by the emitter's index; None if there are none."""
         centres, sides = [[0.0, 0.0, 0.0]] * len(emitters), [0.0] * len(emitters)
         for i, (emitter, name) in enumerate(zip(emitters, names)):
-            shape = emitter.get_shape() if name == "AreaLight" else None
+            shape = emitter.get_shape() if name in AREA else None
             if shape is None or shape.class_name() != "Sphere":
                 continue
             u = mi.Point2f(0.3, 0.6)
@@ -322,7 +322,7 @@ class Lights:
 
     def _sample_infinite(self, emitter, si, u, active):
         ds, weight = emitter.sample_direction(si, u, active)
-        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf), mi.Float(dr.inf),
+        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf),
                            dr.select(ds.pdf > 0, weight, 0),
                            dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta),
                            dr.select(ds.delta, 0, lobe_angle(ds.pdf)))
@@ -370,7 +370,7 @@ class Lights:
         margin = dr.gather(mi.Float, self.area_margins, index, active) / space.size
         margin = dr.fma(ARRIVAL_ROUNDING, way.distance, margin)
         reach = way.distance - margin / dr.maximum(cosine, GRAZING)
-        return LightSample(direction, way.distance, reach,
+        return LightSample(direction, reach,
                            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False),
                            lobe_angle(density))
 
@@ -410,9 +410,8 @@ class Lights:
         reached = active & (density > 0) & (way.distance <= self.max_distance) & (ds.pdf > 0)
         intensity *= dr.square(L)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
-        distance = mi.Float(way.distance)
-        return LightSample(mi.Vector3f(way.direction), distance,
-                           dr.fma(-ARRIVAL_ROUNDING, distance, distance), weight, mi.Float(0),
+        reach = way.distance * (1 - ARRIVAL_ROUNDING)
+        return LightSample(mi.Vector3f(way.direction), reach, weight, mi.Float(0),
                            mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
@@ -445,9 +444,8 @@ class Lights:
         space = self.space
         lit = active & (emitter != None)  # noqa: E711 - an array of pointers
         q = space.to_cells(si.p)
-        back = mi.Vector3f(si.n.x, si.n.y - space.twist * q.x * si.n.z, si.n.z)
         # |N| is lost in the Nil unit normal, which has length 1/|N| as a Euclidean normal.
-        stretch = dr.rcp(dr.norm(back))
+        stretch = dr.rcp(dr.norm(geometry.conormal(q, si.n, -space.twist)))
         number = dr.reinterpret_array(mi.UInt32, emitter)
         # Density on the surface per unit of Nil's area
         per_area = dr.gather(mi.Float, self.area_densities, number, lit) / stretch

@@ -26,7 +26,6 @@ import mitsuba as mi
 
 from . import __version__, checkpoint, parameters
 from .checkpoint import Checkpoint
-from .exr import component_format
 from .layers import LAYERS, channel_names
 from .sums import Sums, develop, luminance
 
@@ -34,7 +33,7 @@ from .sums import Sums, develop, luminance
 CHECKPOINT_SECONDS = 60.0
 
 # With a rule for time or noise, passes have so many samples in all, at least one per pixel: the
-# rules are looked at between passes. Each pass costs a tenth of a second besides its samples.
+# rules are looked at between passes, each of which costs some hundredths of a second besides.
 LOOK_SAMPLES = 2**19
 
 # The variance between fewer passes says little about a picture of few pixels.
@@ -430,6 +429,13 @@ def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
         planes[layer] = image[:, :, at:end]
         at = end
     return Picture(names, image[:, :, :len(names)], planes, settings["film"]["component_format"])
+
+
+def component_format(film: mi.Film) -> str:
+    """The type in which a film wants its pixels stored: "float16", "float32" or "uint32"."""
+    # A film tells it nowhere but in its description.
+    match = re.search(r"component_format = (\w+)", str(film))
+    return match[1] if match else "float32"
 
 
 def film_settings(film: mi.Film) -> dict:

@@ -8,7 +8,6 @@ import pytest
 
 import nil_mitsuba
 from benchmarks.studio import film, gradient
-from test_light_kinds import nil
 
 KINDS = ["point", "spot", "projector"]
 
@@ -79,7 +78,7 @@ def test_a_beam_is_the_same_far_from_the_origin_and_in_small_units(rgb, kind, pl
 
 
 def rendered(how, scene):
-    integrator = nil(1)
+    integrator = mi.load_dict({"type": "nil", "quotient": False, "max_depth": 3})
     if how == "mi.render":
         return mi.render(scene, integrator=integrator, spp=16, seed=3)
     return nil_mitsuba.render(scene, integrator=integrator, spp=16, seed=3)

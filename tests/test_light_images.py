@@ -307,7 +307,7 @@ def test_directions_along_the_fibre_and_past_the_cut_point_are_finite(rgb):
             found = lights(twist, False, reach, lamp=point_light((0, 0, 0))).sample(
                 surface(lower, mi.Normal3f(0, 0, 1)), independent(dr.width(lower)), mi.Bool(True))
             assert dr.all(dr.isfinite(found.weight[0]) & (found.weight[0] >= 0))
-            assert dr.all(dr.isfinite(found.distance) | (found.weight[0] == 0))
+            assert dr.all(dr.isfinite(found.reach) | (found.weight[0] == 0))
             assert dr.all(dr.isfinite(dr.norm(found.direction)) | (found.weight[0] == 0))
 
 

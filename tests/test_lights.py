@@ -378,7 +378,7 @@ def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, qu
     seen = visible(scene, integrator, si, found)
 
     wide = [Array3f64(*(Float64(c) for c in x)) for x in (p, found.direction)]
-    distance = dr.select(lit, Float64(found.distance), 0)
+    distance = dr.select(lit, Float64(found.reach), 0)
     # Up to the light, and no further: no shorter geodesic ends before the lamp itself
     exact = truth.first_hit(blockers, *wide, distance * (1 - 1e-6), twist, quotient)
     clear = exact.label == truth.NO_SURFACE
