@@ -155,7 +155,9 @@ class Tracer:
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
-        # Shorter chords, and hits that lie closer to the geodesic, are lost in float32's rounding.
+        # Shorter chords, and hits that lie closer to the geodesic, are lost in float32's rounding:
+        # of the position (slack is 16 roundings of it), and of the formulas that flow along the
+        # geodesic, 4e-6 of whose length of 10 cells they are off.
         self.least = opaque(dr.maximum(1e-4, 16 * space.slack))
         self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
         if space.quotient:  # no ray leaves the cube
