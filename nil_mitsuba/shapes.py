@@ -15,13 +15,20 @@ from .quotient import opaque
 ROUNDING = 2**-24  # of float32, relative
 
 # By how many roundings of the largest number that goes into a hit the next ray starts off the
-# surface. A quarter is enough for meshes and spheres, the half for cylinders, of 200,000 hits each
-# (benchmarks/offsets.py); Mitsuba's own offset has 1,500, of the hit's own coordinates.
+# surface. A quarter is enough for spheres and coarse meshes, the half for fine ones, cylinders and
+# disks, of 100,000 hits each (benchmarks/offsets.py). Mitsuba's own offset has 1,500, of the hit's
+# own coordinates.
 ROUNDINGS = 32
-PRECISE = ("Sphere", "Rectangle", "Disk", "Cylinder")
-# Of other kinds little is known (curves, grids, ellipsoids, and whatever but meshes in an instance,
-# where Mitsuba 3.9 intersects scaled spheres to a few digits only).
+SPHERE = int(mi.ShapeType.Sphere)
+PRECISE = (mi.ShapeType.Mesh | mi.ShapeType.Rectangle | mi.ShapeType.Disk | mi.ShapeType.Cylinder
+           | SPHERE)
+# Straight curves need no more than 32 either, but for linear ones as thin as 1e-4 of where they
+# lie. Of bent ones, and of grids and ellipsoids, little is known.
 OTHER_ROUNDINGS = 1500
+# Mitsuba 3.9 intersects spheres in an instance in float32, and with a direction as long as the
+# instance is small: their relative error is some 16 roundings times the square of that length. As
+# a part of the radius, what is not given away to it; at a scale of 1/200 nothing is exact any more.
+MOST_OF_RADIUS = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -60,27 +67,29 @@ class Shapes:
         for each other shape.
 
         A shape's part of them begins at a place that the number of its pointer tells, together
-        with two bits: whether there is an entry for each triangle, and whether little is known.
+        with a bit: whether there is an entry for each triangle.
         """
-        names = [shape.class_name() for shape in self.shapes]
-        self.has_meshes, self.has_others = bool(meshes), len(meshes) < len(names)
-        self.has_instances = "Instance" in names
-        self.has_unknown = any(i not in meshes and name not in PRECISE
-                               for i, name in enumerate(names))
+        instances = [shape.class_name() == "Instance" for shape in self.shapes]
+        self.has_meshes, self.has_others = bool(meshes), len(meshes) < len(self.shapes)
+        self.has_instances = any(instances)
+        self.has_unknown = not all(shape.shape_type() & PRECISE for shape in self.shapes)
         pointers = list(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
         places = [0] * (max(pointers, default=0) + 1)
-        others = [i for i in range(len(names)) if i not in meshes]
+        others = [i for i in range(len(self.shapes)) if i not in meshes]
         largest = [mi.Float([_largest(self.shapes[i], self.extents[i].box) for i in others])] \
             if others else []
         for place, i in enumerate(others):
-            places[pointers[i]] = place << 2 | (names[i] not in PRECISE) << 1
+            places[pointers[i]] = place << 1
         place = len(others)
         for i, triangles in meshes.items():
-            places[pointers[i]] = place << 2 | 1
+            places[pointers[i]] = place << 1 | 1
             place += triangles.count
             largest.append(triangles.largest)
         self.places = opaque(mi.UInt32(places))
         self.largest = opaque(dr.concat(largest) if largest else mi.Float(0))
+        if self.has_instances:
+            self.shrinkage = opaque(mi.Float([_shrinkage(self.shapes[i]) if instances[i] else 0
+                                              for i in others]))
 
     def margin(self, si: mi.SurfaceInteraction3f, length: mi.Float) -> mi.Float:
         """How far (scene units) from a hit a ray has to start, not to meet the surface again.
@@ -90,9 +99,10 @@ class Shapes:
         valid = si.is_valid()
         shape = si.shape
         if self.has_instances:
-            shape = dr.select(si.instance == None, shape, si.instance)  # noqa: E711
+            instanced = si.instance != None  # noqa: E711
+            shape = dr.select(instanced, si.instance, shape)
         place = dr.gather(mi.UInt32, self.places, dr.reinterpret_array(mi.UInt32, shape), valid)
-        index = place >> 2
+        index = place >> 1
         if self.has_meshes:
             by_triangle = (place & 1) == 1
             index += dr.select(by_triangle, si.prim_index, 0)
@@ -101,13 +111,17 @@ class Shapes:
             if self.has_meshes:
                 length = dr.select(by_triangle, 0, length)
             largest = dr.maximum(largest, length)
-        roundings = mi.Float(ROUNDINGS)
-        if self.has_unknown:
-            unknown = (place & 2) == 2
-            if self.has_instances:
-                unknown &= ~si.shape.is_mesh()
-            roundings = dr.select(unknown, OTHER_ROUNDINGS, roundings)
-        return roundings * ROUNDING * largest
+        if not self.has_unknown:
+            return ROUNDINGS * ROUNDING * largest
+        kind = si.shape.shape_type()
+        margin = dr.select((kind & PRECISE) != 0, ROUNDINGS, OTHER_ROUNDINGS) * ROUNDING * largest
+        if self.has_instances:
+            radius = dr.norm(si.dp_dv) * dr.inv_pi
+            shrinkage = dr.gather(mi.Float, self.shrinkage, index, valid & instanced)
+            shrunk = dr.minimum(ROUNDINGS * ROUNDING * shrinkage, MOST_OF_RADIUS) * radius
+            margin = dr.select(instanced & (kind == SPHERE),
+                               dr.maximum(margin, shrunk), margin)
+        return margin
 
 
 def name_of(shape: mi.Shape) -> str:
@@ -132,7 +146,7 @@ def margin_on(shape: mi.Shape | None) -> float:
     if shape is None:
         return 0.0
     extent = extent_of(shape)
-    known = shape.is_mesh() or shape.class_name() in PRECISE
+    known = shape.shape_type() & PRECISE
     return (ROUNDINGS if known else OTHER_ROUNDINGS) * ROUNDING * _largest(shape, extent.box)
 
 
@@ -166,6 +180,13 @@ def _largest(shape, box):
     moved = [c + turn[i][3] for i, c in enumerate(corner)]
     local = [sum(row[j] * moved[j] for j in range(3)) for row in back]
     return max(sum(row[j] * local[j] for j in range(3)) + row[3] for row in turn)
+
+
+def _shrinkage(instance):
+    """Square of how much longer an instance makes a ray's direction than it is, or a little more:
+    for a uniform scale s, 3/s²."""
+    inverse = dr.rcp(mi.traverse(instance)["to_world"].matrix)
+    return sum(inverse[i, j][0] ** 2 for i in range(3) for j in range(3))
 
 
 class _Triangles:
