@@ -458,9 +458,13 @@ class Lights:
             textured = per_uv / dr.norm(dr.cross(si.dp_du, si.dp_dv))
             per_area = dr.select(varying, textured, per_area)
 
-        # From the vertex itself, as `sample` does; second order in the offset is left out.
-        ahead = dr.dot(geometry.to_frame(p, mi.Vector3f(start - p), space.twist), v)
-        density = geometry.area_density(hit.distance + ahead, hit.arrival.z, space.twist)
+        # What the segment would have found from the vertex itself, as `sample` does: of the light's
+        # tangent plane the point in the same direction, which is as far as the start is off the
+        # vertex along the light's normal. Where that is far, the light is seen edge on.
+        beside = geometry.to_frame(p, mi.Vector3f(start - p), space.twist)
+        ahead = dr.dot(si.n, beside) / dr.dot(si.n, hit.arrival)
+        distance = hit.distance * (1 + dr.clip(ahead / hit.distance, -0.25, 0.25))
+        density = geometry.area_density(distance, hit.arrival.z, space.twist)
         density *= dr.square(space.size)
         cosine = dr.abs(dr.dot(si.n, hit.arrival))
         half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance
