@@ -19,6 +19,7 @@ from benchmarks.studio import (
     write_ply,
 )
 
+
 def sphere_room():
     return {"room": glowing({"type": "sphere", "flip_normals": True})}
 
