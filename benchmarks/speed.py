@@ -183,6 +183,27 @@ def traced_length(scene):
     return sums[0] / sums[1]
 
 
+def against_extent(halves, spp, rounds):
+    """What the size of a ground costs in plain Nil, under a sky: processor time over ``path``'s."""
+    print("\nplain, a ball on a ground: half size of the ground, time over path's")
+    look = mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0.5], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 64, "height": 64}
+    for half in halves:
+        ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half)}
+        times = {}
+        for integrator in ({"type": "path"}, {"type": "nil", "quotient": False}):
+            scene = mi.load_dict({
+                "type": "scene", "integrator": integrator, "sky": {"type": "constant"},
+                "sensor": {"type": "perspective", "to_world": look, "film": film},
+                "ground": ground,
+                "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
+            })
+            times[integrator["type"]] = [seconds(scene, spp, seed)[0] for seed in range(rounds + 1)]
+        ratios = sorted(n / p for n, p in zip(times["nil"][1:], times["path"][1:]))
+        print(f"{half:9,.0f}   {ratios[rounds // 2]:.1f}   "
+              f"({1e6 * min(times['nil']) / (64 * 64 * spp):.2f} µs a path)", flush=True)
+
+
 def bumpy_sphere(n):
     """A sphere with waves, of 2 n² triangles, in the middle of the unit cube."""
     index = dr.arange(mi.UInt32, (n + 1) * (n + 1))
@@ -230,6 +251,7 @@ if __name__ == "__main__":
         pixels_off(16, 4)
         against_triangles((1_000,))
         against_straight(1_000, (2,), 1, 1)
+        against_extent((1_000,), 1, 1)
     else:
         memory(1024)
         first_render()
@@ -237,3 +259,4 @@ if __name__ == "__main__":
         pixels_off(128, 1024)
         against_triangles((1_000, 10_000, 100_000, 1_000_000))
         against_straight(240_000, (2, 4, 8), 32, 5)
+        against_extent((10, 100, 1_000, 100_000), 256, 5)
