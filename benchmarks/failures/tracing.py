@@ -253,10 +253,11 @@ PLASTER = {"type": "twosided", "sides": {"type": "diffuse", "reflectance": grey(
 def lights_behind(x):
     """Lights around the room |x|, |y|, |z| ≤ 1, behind walls that reach to x.
 
-    A shadow ray ends 9e-5 of its length before the light (1500 · 2⁻²⁴): half a thousandth, for the
-    longest ones. What is a thousandth behind a wall must not shine through it.
+    A shadow ray ends 2e-6 of its length before the light, and before an area light 32 roundings of
+    its coordinates over the cosine there, which is taken for 1/32 at least: 1.2e-4 in all. What is
+    2e-4 behind a wall must not shine through it.
     """
-    x += 1e-3
+    x += 2e-4
     T = mi.ScalarTransform4f()
     return {
         "near": {"type": "point", "position": [x, 0.2, 0.1], "intensity": grey(10.0)},
@@ -340,7 +341,7 @@ def contact_rays(count=20_000, make=package):
     at_ball = dr.arange(UInt32, count) % 2 == 0
     x = dr.select(at_ball, 0.2 + r * c, -1 + 2e-3 + 0.02 * Float64(u))
     y = dr.select(at_ball, 0.3 + r * s, 1 - 2e-3 - 0.02 * beside)
-    p = Array3f(Float(x), Float(y), Float(-1 + 3000 * 2**-24))
+    p = Array3f(Float(x), Float(y), Float(-1 + 32 * 2**-24))
     v.z = dr.abs(v.z)
     dr.eval(p, v)
     wrong = naming(surfaces, p, v, 1, False, make=make)[2]
