@@ -1,6 +1,6 @@
 """The tracers that are compared, and the first hits of rays by any of them.
 
-A tracer is made by a function of the scene, the space, the longest distance and the scene's box if
+A tracer is made by a function of the scene, the space, the longest distance and the scene's shapes if
 it is known, once a variant is set.
 """
 
@@ -25,18 +25,18 @@ def allowance(t, twist):
     return (2e-5 + 2e-6 * t) * math.sqrt(1 + twist**2)
 
 
-def package(scene, space, max_distance, box=None):
+def package(scene, space, max_distance, shapes=None):
     from nil_mitsuba.tracer import Tracer
 
-    return Tracer(scene, space, max_distance, box)
+    return Tracer(scene, space, max_distance, shapes)
 
 
 def chords(method, knob):
     """What makes a tracer by a method of ``tracing_methods``, which needs a variant."""
-    def make(scene, space, max_distance, box=None):
+    def make(scene, space, max_distance, shapes=None):
         from .tracing_methods import METHODS, ChordTracer
 
-        return ChordTracer(scene, space, max_distance, METHODS[method], knob, box)
+        return ChordTracer(scene, space, max_distance, METHODS[method], knob, shapes)
     return make
 
 

@@ -222,8 +222,8 @@ class ChordTracer(Tracer):
     meets it; the cone that the viewer allows is not used.
     """
 
-    def __init__(self, scene, space, max_distance, method, knob, box=None):
-        super().__init__(scene, space, max_distance, box)
+    def __init__(self, scene, space, max_distance, method, knob, shapes=None):
+        super().__init__(scene, space, max_distance, shapes)
         self.method = method(dr.opaque(mi.Float, knob), space.twist)
 
     def intersect(self, p, v, cone, reach, active, time=0):

@@ -1,4 +1,4 @@
-"""How far a geodesic certainly stays outside of a box, however many turns of its helix that takes.
+"""How far a geodesic certainly stays outside of boxes, however many turns of its helix that takes.
 
 Along a geodesic x and y are sinusoids of the angle u = k w t. b − k w x = 2 m and a + k w y = n are
 conserved, and so z' = w + k x b = (w² + b² − 2 m b)/w. It follows that |z''| = 2 |k a (b − m)|,
@@ -8,15 +8,24 @@ more than `Passage.dip` in one turn, and that it gains the same height in every 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+
 import drjit as dr
 import mitsuba as mi
 
 from . import geometry
+from .quotient import Space, opaque
 
 # Roundings of the conserved quantities, times ten: a helix that misses a box by less may meet it.
 MARGIN = 1e-5
 # A little less, or rounding takes the ray behind what lies on the box.
 SHORT = 0.999
+
+# Each box costs as much arithmetic as the last, in every step outside of them.
+MOST_BOXES = 4
+# More shapes are not looked at one by one, which takes the cube of their number.
+MOST_SHAPES = 16
 
 
 class Passage:
@@ -97,3 +106,59 @@ class Box:
             margin = MARGIN * (1 + dr.abs(centre) + dr.abs(low) + dr.abs(high))
             beside |= (low - (centre + c) > margin) | ((centre - c) - high > margin)
         return beside
+
+
+class Occupied:
+    """A few boxes outside of which there is nothing."""
+
+    def __init__(self, boxes: Iterable[mi.ScalarBoundingBox3f], space: Space):
+        """``boxes``: those of a scene's shapes (scene units)."""
+        self.boxes = [Box(space.to_cells(opaque(mi.Point3f(box.min))),
+                          space.to_cells(opaque(mi.Point3f(box.max))))
+                      for box in gathered(boxes, space.size_number)]
+        self.lower = self.boxes[0].lower
+        self.upper = self.boxes[0].upper
+        for box in self.boxes[1:]:
+            self.lower = dr.minimum(self.lower, box.lower)
+            self.upper = dr.maximum(self.upper, box.upper)
+
+    def excludes(self, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies outside of all."""
+        return dr.all([box.excludes(p) for box in self.boxes], axis=0)
+
+    def clearance(self, p: mi.Point3f, v: mi.Vector3f, passage: Passage) -> mi.Float:
+        """`Box.clearance`, of whichever box comes first."""
+        return dr.min([box.clearance(p, v, passage) for box in self.boxes], axis=0)
+
+
+def gathered(boxes: Iterable[mi.ScalarBoundingBox3f], size: float
+             ) -> list[mi.ScalarBoundingBox3f]:
+    """As few boxes as hold all of these without holding much else; ``size`` is that of a cell.
+
+    Rays go by chords of up to a cell inside, so that what counts is a box's volume, a cell wider
+    than it is each way. Two boxes become one unless that is more than twice their own volumes.
+    """
+    found = [box for box in boxes if box.valid()]
+    if not found:  # a scene of environment emitters only
+        return [mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])]
+    if len(found) > MOST_SHAPES:
+        return [_around(found)]
+
+    def volume(box):
+        return math.prod(extent / size + 1 for extent in box.extents())
+
+    while len(found) > 1:
+        pairs = [(volume(_around((a, b))) / (volume(a) + volume(b)), i, j)
+                 for j, b in enumerate(found) for i, a in enumerate(found[:j])]
+        waste, i, j = min(pairs)
+        if waste > 2 and len(found) <= MOST_BOXES:
+            break
+        found[i] = _around((found[i], found.pop(j)))
+    return found
+
+
+def _around(boxes):
+    result = mi.ScalarBoundingBox3f()
+    for box in boxes:
+        result.expand(box)
+    return result

@@ -340,7 +340,7 @@ class View:
         self.space = Space(integrator.twist, integrator.quotient, list(integrator.cell_origin),
                            integrator.cell_size)
         self.shapes = Shapes(scene)
-        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes.box)
+        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
         self.layers = [layer for layer in integrator.layers if LAYERS[layer].rule != "count"]

@@ -32,6 +32,7 @@ class Space:
         self.twist = dr.opaque(mi.Float, twist)
         self.integer_twist = dr.opaque(mi.Int32, round(twist))
         self.origin = opaque(mi.Point3f(*origin))
+        self.size_number = size
         self.size = dr.opaque(mi.Float, size)
         self.largest = dr.opaque(mi.Float, max(map(abs, origin)))  # of the origin's coordinates
         # A few units in the last place of the largest scene coordinate near the cube, in cells:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from textwrap import shorten
@@ -13,6 +12,7 @@ import mitsuba as mi
 from .quotient import opaque
 
 ROUNDING = 2**-24  # of float32, relative
+FAR = 1e15  # scene units; squares of the distances between larger numbers overflow
 
 # By how many roundings of the largest number that goes into a hit the next ray starts off the
 # surface. A quarter is enough for spheres and coarse meshes, the half for fine ones, cylinders and
@@ -35,8 +35,8 @@ MOST_OF_RADIUS = 1 / 8
 class Extent:
     """Bounding box (scene units) of what of a shape can be hit, not valid if nothing can.
 
-    ``lost`` says what of the shape cannot, since its coordinates are no finite numbers; "" if all
-    of it can.
+    ``lost`` says what of the shape cannot, since its coordinates are no numbers, infinite or beyond
+    `FAR`; "" if all of it can.
     """
 
     box: mi.ScalarBoundingBox3f
@@ -157,8 +157,8 @@ def extent_of(shape: mi.Shape) -> Extent:
 
 def _extent(shape):
     box = shape.bbox()
-    if box.valid() and not all(map(math.isfinite, (*box.min, *box.max))):
-        return Extent(mi.ScalarBoundingBox3f(), "its position or size is no finite number")
+    if not all(abs(c) < FAR for c in (*box.min, *box.max)) and box.valid():
+        return Extent(mi.ScalarBoundingBox3f(), "its position or size is no number up to 1e15")
     return Extent(box)
 
 
@@ -198,7 +198,7 @@ class _Triangles:
         triangle = dr.arange(mi.UInt32, self.count)
         a, b, c = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
                    for i in range(3))
-        finite = dr.all(dr.isfinite(a + b + c))
+        finite = dr.all((dr.abs(a) < FAR) & (dr.abs(b) < FAR) & (dr.abs(c) < FAR))
         low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         self.largest = dr.max(dr.maximum(dr.abs(low), dr.abs(high)))
         low, high = dr.select(finite, low, dr.inf), dr.select(finite, high, -dr.inf)
@@ -211,5 +211,5 @@ class _Triangles:
         if self.whole[0]:
             box = mi.ScalarBoundingBox3f([x[0] for x in self.low], [x[0] for x in self.high])
         lost = self.count - self.whole[0]
-        return Extent(box, f"{lost} of its {self.count} triangles have corners that are no finite "
-                           "numbers" if lost else "")
+        return Extent(box, f"{lost} of its {self.count} triangles have corners that are no numbers "
+                           "up to 1e15" if lost else "")

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
-from .box import Box, Passage
+from .box import Occupied, Passage
 from .quotient import Space, exit_through_face, opaque, through_face
 from .shapes import Shapes
 
@@ -151,7 +151,7 @@ class Tracer:
     """Follows geodesics through a scene, in plain Nil or in the quotient."""
 
     def __init__(self, scene: mi.Scene, space: Space, max_distance: float,
-                 box: mi.ScalarBoundingBox3f | None = None):
+                 shapes: Shapes | None = None):
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
@@ -162,11 +162,8 @@ class Tracer:
         self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
         if space.quotient:  # no ray leaves the cube
             return
-        box = box or Shapes(scene).box
-        if not box.valid():  # a scene of environment emitters only
-            box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
-        self.box = Box(space.to_cells(opaque(mi.Point3f(box.min))),
-                       space.to_cells(opaque(mi.Point3f(box.max))))
+        extents = (shapes or Shapes(scene)).extents
+        self.occupied = Occupied((extent.box for extent in extents), space)
 
     # ------------------------------------------------------------------ lengths
 
@@ -183,7 +180,7 @@ class Tracer:
             limit = self.max_distance
         if self.space.quotient:
             return limit
-        far = dr.maximum(dr.abs(self.box.lower - p), dr.abs(self.box.upper - p))
+        far = dr.maximum(dr.abs(self.occupied.lower - p), dr.abs(self.occupied.upper - p))
         k = dr.abs(self.space.twist)
         c = dr.hypot(v.x, v.y)
         w = dr.abs(v.z)
@@ -196,17 +193,17 @@ class Tracer:
     def _approach(self, p: mi.Point3f, v: mi.Vector3f, chords: Chords, stretch: mi.Float,
                   vertex: mi.Point3f, base: mi.Point3f, direction: mi.Vector3f, t: mi.Float,
                   reach: mi.Float, active: mi.Bool):
-        """Pass what is empty before the scene's box, if ``vertex`` (at arc length t) is outside.
+        """Pass what is empty before the scene's boxes, if ``vertex`` (at arc length t) is outside.
 
         Returns the vertex, the geodesic's point and direction there and their arc length (cells),
-        which is ``reach`` where the geodesic does not come (back) to the box before.
+        which is ``reach`` where the geodesic does not come (back) to a box before.
         """
-        leaping = active & self.box.excludes(vertex)
+        leaping = active & self.occupied.excludes(vertex)
         if leaping:  # a branch: most rays are inside
             passage = Passage(p, v, self.space.twist)
             start = mi.Float(t)
             while leaping:
-                free = self.box.clearance(base, direction, passage)
+                free = self.occupied.clearance(base, direction, passage)
                 leaping &= free > stretch * chords.after(t)
                 t = dr.select(leaping, dr.minimum(t + free, reach), t)
                 leaping &= t < reach

@@ -62,8 +62,8 @@ def rendered(scene, setup, method, knob, spp, seed):
                              "max_depth": 3, "max_distance": float(MAIN["length"]),
                              "tolerance": knob if method == PACKAGE else DEFAULT})
 
-    def tracer(scene, space, max_distance, box):
-        return tracer_of(method, knob, scene, space, max_distance, box)
+    def tracer(scene, space, max_distance, shapes):
+        return tracer_of(method, knob, scene, space, max_distance, shapes)
 
     with mock.patch.object(integrator, "Tracer", tracer):
         return timed(lambda: mi.render(scene, integrator=renderer, spp=spp, seed=seed))

@@ -20,11 +20,11 @@ KNOBS = {
 DEFAULT = mi.load_dict({"type": "nil"}).tolerance
 
 
-def tracer_of(method, knob, scene, space, max_distance=math.inf, box=None):
+def tracer_of(method, knob, scene, space, max_distance=math.inf, shapes=None):
     """A tracer with one setting of the method's knob."""
     if method == PACKAGE:
-        return Tracer(scene, space, max_distance, box)
-    return ChordTracer(scene, space, max_distance, METHODS[method], knob, box)
+        return Tracer(scene, space, max_distance, shapes)
+    return ChordTracer(scene, space, max_distance, METHODS[method], knob, shapes)
 
 
 def timed(run):
