@@ -96,7 +96,8 @@ def assert_same_mean(moved, there, integrators, limit, spp, passes=12):
 @pytest.mark.parametrize("twist, quotient, d, limit, spp", [
     *((0, False, d, limit, 64) for d, limit in ((1000, 5e-4), (3000, 5e-4), (10_000, 2e-3))),
     *(pytest.param(1, True, d, limit, 128, marks=pytest.mark.verify)
-      for d, limit in ((1000, 2e-3), (3000, 2e-3), (10_000, 1.7e-2))),
+      # At 3,000 the rounding of what stands in the cell is a third of 0.28 %
+      for d, limit in ((1000, 2e-3), (3000, 3e-3), (10_000, 1e-2))),
 ])
 def test_a_scene_far_from_zero_is_lit_as_at_home(rgb, twist, quotient, d, limit, spp):
     """Everything is moved, and ``cell_origin`` with it."""
