@@ -9,6 +9,7 @@ Run from the root of a checkout, with the extra ``test`` installed (``chart`` fo
     python -m benchmarks.speed               # cost against ``path``
     python -m benchmarks.emitter_sampling    # what emitter sampling is worth
     python -m benchmarks.stills              # what passes, layers and checkpoints cost
+    python -m benchmarks.offsets             # whether next rays leave their surface, and leaks
 
 The truth: ``truth`` (first hits by root finding in float64), ``reference_geometry`` (mpmath and
 ODEs), ``light_truth`` (which geodesics bring light) and ``face_crossing``. The peers:
