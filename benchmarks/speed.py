@@ -28,7 +28,7 @@ def bent_box(width, rfilter="gaussian", **properties):
     scene["integrator"] = {
         "type": "nil", "max_depth": 6, "quotient": False, "cell_size": 2.0,
         "cell_origin": mi.ScalarPoint3f(-1, -1, -1),
-    } | properties  # fmt: skip
+    } | properties
     return mi.load_dict(scene)
 
 
@@ -128,7 +128,7 @@ def bumpy_scene(triangles, **properties):
         },
         "sky": {"type": "constant"},
         "mesh": bumpy_sphere(round(math.sqrt(triangles / 2))),
-    })  # fmt: skip
+    })
 
 
 def against_triangles(sizes):

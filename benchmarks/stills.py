@@ -113,7 +113,7 @@ def peak_memory(spp):
             [sys.executable, "-c", code, "render", SCENE, "-D", "resx=480", "-D", "resy=270",
              "-P", "max_depth=4", "--spp", str(spp), "-o", os.path.join(folder, "a.exr")],
             capture_output=True, text=True, check=True,
-        )  # fmt: skip
+        )
     return float(run.stdout.split()[-1])
 
 

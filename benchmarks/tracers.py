@@ -1,7 +1,7 @@
 """The tracers that are compared, and the first hits of rays by any of them.
 
-A tracer is made by a function of the scene, the space, the longest distance and the scene's shapes if
-it is known, once a variant is set.
+A tracer is made by a function of the scene, the space, the longest distance and the scene's shapes
+if they are known, once a variant is set.
 """
 
 import math

@@ -206,7 +206,7 @@ def picture_options(command):
                      help="Remove noise; the noisy picture stays as a layer."),
         click.option("--compression", type=click.Choice(list(exr.COMPRESSIONS)), default="zip",
                      show_default=True, help="Of the EXR file; dwaa and dwab are lossy."),
-    )):  # fmt: skip
+    )):
         command = option(command)
     return command
 
@@ -240,18 +240,18 @@ def picture_options(command):
 @click.option(
     "-D", "--define", type=Assignment(), multiple=True,
     help='Define a constant that the scene refers to as "$key".',
-)  # fmt: skip
+)
 @click.option(
     "-s", "--sensor", metavar="INDEX", type=click.IntRange(0), default=0, show_default=True,
     help="Sensor to render with, in the scene's order.",
-)  # fmt: skip
+)
 @click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
 @click.option(
     "-P", "--property", "properties", metavar="NAME=VALUE", type=Assignment(), multiple=True,
     help='Set a property of the integrator "nil", such as twist=0 or cell_origin=-1,-1,-1.',
-)  # fmt: skip
+)
 @click.option("--fit", is_flag=True, help="Fit the cell to the scene's bounding box.")
 def render(**options):
     """Render a scene with the integrator "nil", whatever integrator it names.

@@ -42,13 +42,13 @@ HALF_MAX = 65504.0  # largest number of float16
 STRUCTURE = frozenset({
     "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version",
-})  # fmt: skip
+})
 
 # Metadata in the order in which people ask for them; others follow by name.
 FIRST = (
     "commandLine", "scene", "sceneHash", "spp", "seed", "passes", "renderTime", "capDate",
     "utcOffset", "software", "variant",
-)  # fmt: skip
+)
 
 
 def write(

@@ -17,7 +17,7 @@ from .layers import RENDERED
 NAMES = (
     "twist", "quotient", "cell_origin", "cell_size", "tolerance", "max_distance",
     "max_depth", "rr_depth", "hide_emitters", "aovs",
-)  # fmt: skip
+)
 
 
 def checked(given: Mapping[str, Any]) -> dict[str, Any]:

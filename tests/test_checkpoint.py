@@ -38,7 +38,7 @@ CHANGES = {
     "seed": (lambda: mi.load_dict(description()), {"seed": 1}, "seed is 0 there and 1 here"),
     "scene": (lambda: mi.load_dict(description() | {"sky": {"type": "constant", "radiance": 0.2}}),
               {}, "the scene or a file that it names has changed"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", CHANGES)

@@ -175,7 +175,7 @@ def test_bad_arguments_get_one_sentence_before_rendering(
 
 
 @pytest.mark.parametrize("option", ["--noise=1", "--time=1s", "--resume", "--checkpoint=a.sums",
-                                    "--passes=0:1", "--pass-spp=1", "--layers=cell"])  # fmt: skip
+                                    "--passes=0:1", "--pass-spp=1", "--layers=cell"])
 def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
     moment = '<integrator type="moment"><integrator type="nil"/></integrator>'
     (folder / "scene.xml").write_text(scene(moment, SENSOR, LAMP))
@@ -190,7 +190,7 @@ def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
      (["info", "a.sums"], 1, ["a.sums", "No such file"]), (["merge", "-o", "a.exr"], 2, ["PARTS"]),
      (["merge", "scene.xml"], 2, ["-o"]),
      (["merge", "scene.xml", "-o", "a.exr"], 1, ["scene.xml", "no checkpoint"])],
-)  # fmt: skip
+)
 def test_files_that_are_not_there_or_something_else(command, arguments, expected, fragments):
     status, out, err = command(*arguments)
     line = complaint(err)
@@ -244,7 +244,7 @@ def test_names_may_be_as_long_as_the_file_system_allows(command, folder, name):
     [(300 * "a" + ".exr", "too long"), (251 * "a" + ".exr", "too long"),  # of its .sums
      ("caf\udce9.exr", "UTF-8"), ("pipe.exr", "not an ordinary file"),
      ("link.exr", "cannot write to the folder")],
-)  # fmt: skip
+)
 def test_names_that_cannot_be_written_are_refused_before_rendering(
     command, folder, rendering_is_an_error, name, fragment
 ):

@@ -52,7 +52,7 @@ def test_layers_keep_their_values_whatever_the_compression(
     exr.write(
         tmp_path / "a.exr", ("RGBA", picture), layers,
         component_format=component_format, compression=compression,
-    )  # fmt: skip
+    )
     types, channels = read_channels(tmp_path / "a.exr")
 
     assert set(channels) == {*"RGBA", *channel_names(LAYERS)}
@@ -211,7 +211,7 @@ def test_a_film_is_written_in_its_own_format(tmp_path):
     ({"component_format": "float64"}, ['"float64"', "float16"]),
     ({"picture": "RGBA"}, ["R, G, B, A", str((HEIGHT, WIDTH, 4)), str((HEIGHT, WIDTH, 3))]),
     ({"picture": "RGR"}, ['two channels "R"']),
-])  # fmt: skip
+])
 def test_what_does_not_fit_together_is_named(tmp_path, arguments, words):
     picture = arguments.pop("picture", "RGB"), random_image(3)
     layers = {key: random_image(*n) for key, n in arguments.pop("layers", {}).items()}
@@ -231,7 +231,7 @@ def test_the_description_tells_size_layers_and_metadata(tmp_path):
         "(picture) R G B A float16", "albedo R G B float16", "cell X Y Z float32",
         "depth Z float32", "samples X float32", "spp 64", "seed 4294967295", "tolerance 0.25",
         "renderTime 12.345678901", "quotient true",
-    ):  # fmt: skip
+    ):
         assert row.split() in words, row
     # A value of several lines stays in its column.
     start = next(i for i, line in enumerate(lines) if line.startswith("  integrator"))
@@ -249,7 +249,7 @@ def test_files_of_others_are_described_too(tmp_path):
          "tiles": OpenEXR.TileDescription(), "focus": 0.1, "tags": ["a", "b"],
          "preview": OpenEXR.PreviewImage(1, 1), "whitePoint": (0.3127, 0.3290)},
         {"R": plane, "other.long": plane}, "left",
-    )  # fmt: skip
+    )
     right = OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"Z": plane}, "right")
     with OpenEXR.File([left, right]) as file:
         file.write(str(tmp_path / "a.exr"))
@@ -257,7 +257,7 @@ def test_files_of_others_are_described_too(tmp_path):
     for words in (
         'part "left", 53 x 37 pixels, compression piz, in tiles', 'part "right"', "owner",
         "Ada", "0.1\n", "a, b", "(preview, ", "0.3127",
-    ):  # fmt: skip
+    ):
         assert words in text, words
     assert metadata_of(tmp_path / "a.exr")["owner"] == "Ada"
 

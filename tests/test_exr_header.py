@@ -38,7 +38,7 @@ def test_what_is_not_an_exr_file_gets_one_sentence(tmp_path):
     for name, words in {
         "a.exr": "is not an OpenEXR file", "empty.exr": "is not an OpenEXR file",
         "none.exr": "No such file", ".": "directory",
-    }.items():  # fmt: skip
+    }.items():
         for function in (exr.describe, exr_header.read):
             with pytest.raises((OSError, ValueError)) as error:
                 function(tmp_path / name)

@@ -19,7 +19,7 @@ def scene(rgb):
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
         "sky": {"type": "constant"},
         "ball": {"type": "sphere", "center": [0, 0, 3]},
-    })  # fmt: skip
+    })
 
 
 def causes(error):

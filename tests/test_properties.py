@@ -63,7 +63,7 @@ def test_a_misspelt_property_of_a_scene_file_is_told_with_the_nearest_one(rgb):
      {"max_depth": 2}, {"hide_emitters": True}, {"max_distance": 0.4},
      {"quotient": False}],
     ids=str,
-)  # fmt: skip
+)
 def test_a_property_that_is_set_is_that_of_the_next_picture(scene, changes):
     before = render(scene)
     for name, value in changes.items():

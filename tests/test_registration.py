@@ -175,7 +175,7 @@ def test_shapes_outside_the_cube_and_media_are_named(rgb, capfd):
         "outside": {"type": "sphere", "center": [0.5, 0.5, 0.9], "radius": 0.25},
         "cloud": {"type": "sphere", "center": [0.2, 0.2, 0.2], "radius": 0.1,
                   "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
-    })  # fmt: skip
+    })
     mi.render(scene, spp=1)
     text = capfd.readouterr().out
     assert '"outside" reaches 0.15 scene units out of the cube' in text

@@ -86,7 +86,7 @@ def test_fit_puts_the_scene_into_the_cell(command, folder):
 
     # What --fit prints can be typed in.
     status, _, _ = command("render", "scene.xml", "-P", f"cell_origin={corner}",
-                           "-P", f"cell_size={size!r}")  # fmt: skip
+                           "-P", f"cell_size={size!r}")
     assert (status, read("scene.exr")[0]["cell_origin"]) == (0, corner)
 
 
@@ -100,7 +100,7 @@ def test_fit_needs_something_to_fit(command, folder):
     "text, value",
     [("3", 3), ("-2", -2), ("0.5", 0.5), ("1e-3", 1e-3), ("true", True), ("False", False),
      ("abc", "abc"), ("1,2", "1,2")],
-)  # fmt: skip
+)
 def test_properties_have_the_type_they_look_like(rgb, text, value):
     parsed = scene_files.parse_value(text)
     assert parsed == value and type(parsed) is type(value)

@@ -83,7 +83,7 @@ def test_a_second_signal_ends_the_command_within_three_seconds(rgb, tmp_path, nu
         [sys.executable, "-c", COMMAND, "render", "room.xml", "--spp", "64", "--pass-spp", "4"],
         cwd=tmp_path, env=os.environ | {"WHERE": where}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    )
     try:
         wait_for(tmp_path / "slow", process)
         process.send_signal(number)
@@ -138,7 +138,7 @@ def scene(rgb):
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
         "sky": {"type": "constant"},
         "ball": {"type": "sphere", "center": [0, 0, 3]},
-    })  # fmt: skip
+    })
 
 
 def test_no_render_from_python_is_watched(scene):

@@ -122,7 +122,7 @@ def test_the_shortest_time_is_that_of_one_pass(small):
      ({"spp": math.nan}, "spp"), ({"spp": math.inf}, "spp"), ({"noise": "0.1"}, "noise"),
      ({"seed": -1}, "seed"), ({"seed": 2**32}, "seed"), ({"sensor": 1}, "1 sensors"),
      ({"sensor": -1}, "1 sensors")],
-)  # fmt: skip
+)
 def test_rules_that_mean_nothing_are_refused(small, wrong, fragment):
     with pytest.raises(ValueError, match=fragment):
         nil_mitsuba.render(small, **wrong)
@@ -178,7 +178,7 @@ def test_whole_numbers_may_be_of_any_kind(small, tmp_path):
     "passes, count, gaps",
     [(((0, 4),), 4, []), (((1, 2), (3, 4)), 6, [(0, 1), (2, 3), (4, 6)]), ((), 2, [(0, 2)]),
      (((0, 8),), 4, [])],
-)  # fmt: skip
+)
 def test_missing_passes_are_named(small, passes, count, gaps):
     state = still_of(small).nothing()
     state.sums.passes, state.about = passes, {"count": count}
@@ -214,7 +214,7 @@ def test_full_hd_stays_below_4_gibibytes(still_folder):
              "-o", str(still_folder / "a.exr"),
              "--layers", "distance,position,normal,albedo,cell,shape,samples"],
             capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
+        )
         assert run.returncode == 0, run.stderr
         sizes.append(int(run.stdout.split()[-1]))  # KiB
     assert sizes[1] < 4 * 2**20

@@ -29,7 +29,7 @@ def description(size=16, sampler="independent", rfilter="box", film=(), **integr
                  "light": {"type": "area"}},
         "ball": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.2,
                  "bsdf": {"type": "diffuse"}},
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def cut(module, monkeypatch):
 
 
 BORDERED = {"sample_border": True, "crop_width": 9, "crop_height": 5, "crop_offset_x": 3,
-            "crop_offset_y": 7}  # fmt: skip
+            "crop_offset_y": 7}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ BORDERED = {"sample_border": True, "crop_width": 9, "crop_height": 5, "crop_offs
     [{}, {"rfilter": "gaussian", "film": BORDERED},
      {"aovs": "distance, position, cell, shape, samples"}],
     ids=["box", "border", "layers"],
-)  # fmt: skip
+)
 def test_the_picture_is_the_same_wherever_wavefronts_are_cut(rgb, cut, scene):
     loaded = mi.load_dict(description(**scene))
     cut(2**14)
