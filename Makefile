@@ -18,6 +18,7 @@ verify: $(VENV)/.installed-test
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
 	$(BIN)/mypy
 
 gallery: $(VENV)/.installed-denoise

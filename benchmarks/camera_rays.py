@@ -23,11 +23,14 @@ def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH, m
 
     space = Space(twist, quotient, [0, 0, 0], 1.0)
     tracer = (make or Tracer)(scene, space, 12.0)
-    sensor = mi.load_dict({
-        "type": "perspective", "fov": 70,
-        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0.01, 0.02, 1]),
-        "film": {"type": "hdrfilm", "width": width, "height": width},
-    })
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 70,
+            "to_world": mi.ScalarTransform4f().look_at(origin, target, [0.01, 0.02, 1]),
+            "film": {"type": "hdrfilm", "width": width, "height": width},
+        }
+    )
     index = dr.arange(mi.UInt32, width * width)
     place = mi.Point2f(index % width + 0.5, index // width + 0.5) / width
     ray, _ = sensor.sample_ray_differential(0, 0.5, place, mi.Point2f(0.5))
@@ -77,14 +80,30 @@ def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
     wrong = ours != theirs
 
     hit_both = ~wrong & (label >= 0)
-    q = truth.multiply(Array3f64(g), Array3f64(*(truth.Float64(dr.detach(c)) for c in found_p)),
-                       twist)
+    q = truth.multiply(
+        Array3f64(g), Array3f64(*(truth.Float64(dr.detach(c)) for c in found_p)), twist
+    )
     error = truth.across_error(*wide, exact.t, q, twist) / (2e-5 + 2e-6 * exact.t)
     error = dr.select(hit_both, error, 0)
     far = dr.count(wrong & ~near)[0] / max(1, dr.count(~near)[0])
     close = dr.count(wrong & near)[0] / max(1, dr.count(near)[0])
-    return far, close, dr.max(error)[0], dict(wrong=wrong, near=near, error=error, exact=exact,
-                                              label=label, g=g, p=p, v=v, cone=cone, tracer=tracer)
+    return (
+        far,
+        close,
+        dr.max(error)[0],
+        dict(
+            wrong=wrong,
+            near=near,
+            error=error,
+            exact=exact,
+            label=label,
+            g=g,
+            p=p,
+            v=v,
+            cone=cone,
+            tracer=tracer,
+        ),
+    )
 
 
 def main():
@@ -99,8 +118,10 @@ def main():
         for twist in (0, 1, 2):
             for tolerance in (1, 0.25, 0.0625):
                 far, close, error, _ = compare(mi, kind, twist, tolerance, width)
-                print(f"{kind:9} {twist:5} {tolerance:10g} {far:21.2e} {close:10.2%} {error:8.3g}",
-                      flush=True)
+                print(
+                    f"{kind:9} {twist:5} {tolerance:10g} {far:21.2e} {close:10.2%} {error:8.3g}",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

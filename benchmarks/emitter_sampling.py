@@ -35,26 +35,42 @@ def small_light():
     def ball(x, y, z, radius, **bsdf):
         return {"type": "sphere", "center": [x, y, z], "radius": radius, "bsdf": bsdf}
 
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "perspective", "fov": 75, "film": film(64),
-                   "to_world": T.look_at([0.5, 0.05, 0.5], [0.5, 0.9, 0.4], [0, 0, 1])},
-        "floor": {"type": "rectangle",
-                  "to_world": T.translate([0.5, 0.5, 0.04]).scale([0.45, 0.45, 1])},
-        "a": ball(0.6, 0.6, 0.24, 0.2, type="diffuse"),
-        "b": ball(0.25, 0.6, 0.18, 0.12, type="roughplastic", alpha=0.2),
-        "c": ball(0.35, 0.35, 0.1, 0.06, type="roughconductor", alpha=0.3),
-        "lamp": {"type": "sphere", "center": [0.4, 0.45, 0.75], "radius": 0.01,
-                 "emitter": {"type": "area",
-                             "radiance": {"type": "rgb", "value": [540, 500, 450]}}},
-    }), {"twist": 1.0, "quotient": True, "max_depth": 6}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 75,
+                "film": film(64),
+                "to_world": T.look_at([0.5, 0.05, 0.5], [0.5, 0.9, 0.4], [0, 0, 1]),
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": T.translate([0.5, 0.5, 0.04]).scale([0.45, 0.45, 1]),
+            },
+            "a": ball(0.6, 0.6, 0.24, 0.2, type="diffuse"),
+            "b": ball(0.25, 0.6, 0.18, 0.12, type="roughplastic", alpha=0.2),
+            "c": ball(0.35, 0.35, 0.1, 0.06, type="roughconductor", alpha=0.3),
+            "lamp": {
+                "type": "sphere",
+                "center": [0.4, 0.45, 0.75],
+                "radius": 0.01,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [540, 500, 450]}},
+            },
+        }
+    ), {"twist": 1.0, "quotient": True, "max_depth": 6}
 
 
 def bent_cornell_box():
     scene = mi.cornell_box()
     scene["sensor"]["film"] = film(64)
-    return mi.load_dict(scene), {"twist": 1.0, "quotient": False, "max_depth": 6,
-                                 "cell_origin": [-1, -1, -1], "cell_size": 2.0}
+    return mi.load_dict(scene), {
+        "twist": 1.0,
+        "quotient": False,
+        "max_depth": 6,
+        "cell_origin": [-1, -1, -1],
+        "cell_size": 2.0,
+    }
 
 
 def relative_mse(image, reference):
@@ -90,9 +106,11 @@ def compare_at_equal_time(name, make, goal, quick):
     (sampled, t_sampled), (found, t_found) = results
     # The mean square error goes like one over the time.
     gain = found * t_found / (sampled * t_sampled)
-    print(f"{name}: {spp} spp with emitter sampling {sampled:.3g} in {t_sampled:.2f} s, without "
-          f"{found:.3g} in {t_found:.2f} s: {gain:.1f} times lower at equal time (goal: {goal})",
-          flush=True)
+    print(
+        f"{name}: {spp} spp with emitter sampling {sampled:.3g} in {t_sampled:.2f} s, without "
+        f"{found:.3g} in {t_found:.2f} s: {gain:.1f} times lower at equal time (goal: {goal})",
+        flush=True,
+    )
 
 
 # ------------------------------------------------------------------ which image
@@ -117,8 +135,9 @@ def choice_against_oracle(p, n, q, twist, max_distance):
     space = Space(float(twist), True, [0, 0, 0], 1.0)
     g = all_images(p, q, twist, max_distance)
     start, light = mi.Point3f(*p), mi.Point3f(*q)
-    way = geometry.connect(start, geometry.multiply(mi.Point3f(g), light, float(twist)),
-                           float(twist))
+    way = geometry.connect(
+        start, geometry.multiply(mi.Point3f(g), light, float(twist)), float(twist)
+    )
     probability = Images(space, max_distance).probability(start, light, g)
     reached = way.distance <= max_distance
     brightness = dr.select(reached, dr.rcp(way.area_density), 0)
@@ -126,8 +145,10 @@ def choice_against_oracle(p, n, q, twist, max_distance):
     value = brightness * cosine
     mean = dr.sum(mi.Float64(value))[0]
     ours = dr.sum(mi.Float64(dr.select(reached, dr.square(value) / probability, 0)))[0] - mean**2
-    oracle = dr.sum(mi.Float64(brightness))[0] * \
-        dr.sum(mi.Float64(brightness * dr.square(cosine)))[0] - mean**2
+    oracle = (
+        dr.sum(mi.Float64(brightness))[0] * dr.sum(mi.Float64(brightness * dr.square(cosine)))[0]
+        - mean**2
+    )
     return dr.count(reached)[0], ours / mean**2, oracle / mean**2
 
 
@@ -152,16 +173,21 @@ def main():
     compare_at_equal_time("small light in the quotient", small_light, 10, quick)
     compare_at_equal_time("bent Cornell box", bent_cornell_box, 3, quick)
 
-    print("choice of an image: variance over squared mean of cos θ / A, drawn as Images does and "
-          "in proportion to 1/A, and their ratio (goal: 2)")
+    print(
+        "choice of an image: variance over squared mean of cos θ / A, drawn as Images does and "
+        "in proportion to 1/A, and their ratio (goal: 2)"
+    )
     ratios = []
     for max_distance in (5.0,) if quick else (5.0, 12.0):
         for twist in (1,) if quick else (0, 1, 2):
             for p, n, q in PAIRS:
                 count, ours, oracle = choice_against_oracle(p, n, q, twist, max_distance)
                 ratios.append(ours / oracle)
-                print(f"  twist {twist}, {count:6} images within {max_distance:g}: {ours:6.2f} "
-                      f"{oracle:6.2f} {ours / oracle:5.2f}", flush=True)
+                print(
+                    f"  twist {twist}, {count:6} images within {max_distance:g}: {ours:6.2f} "
+                    f"{oracle:6.2f} {ours / oracle:5.2f}",
+                    flush=True,
+                )
     print(f"median ratio {sorted(ratios)[len(ratios) // 2]:.2f}, worst {max(ratios):.2f}")
 
 

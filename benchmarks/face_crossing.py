@@ -56,12 +56,12 @@ def _passings(v, step, axis, twist, period):
     """
     a, b = (v.x, v.y) if axis == 0 else (v.y, -v.x)
     kw = twist * v.z
-    swing = kw * step                                   # b − b₀
-    lost = swing * dr.fma(2, b, swing)                  # a₀² − a²
+    swing = kw * step  # b − b₀
+    lost = swing * dr.fma(2, b, swing)  # a₀² − a²
     a2 = dr.fma(a, a, -lost)
     c2 = dr.fma(a, a, b * b)
     reached = (a2 >= 0) & (c2 > 0)
-    same = dr.mulsign(dr.sqrt(dr.maximum(a2, 0)), a)    # a of the sign it had at the start
+    same = dr.mulsign(dr.sqrt(dr.maximum(a2, 0)), a)  # a of the sign it had at the start
     b_there = b + swing
     c2 = dr.select(c2 > 0, c2, 1)
 
@@ -98,18 +98,22 @@ def _first_z(p, v, c, t_max, twist):
     root2 = 0.25 * dr.square(twist) * (across - 2 * v.z) * (across + 2 * v.z)
     turns = root2 >= 0
     q = -(half + dr.mulsign(dr.sqrt(dr.maximum(root2, 0)), half))
-    rate = dr.fma(twist * p.x, v.y, v.z)                # dz/dt at the start
+    rate = dr.fma(twist * p.x, v.y, v.z)  # dz/dt at the start
     square = twist * kw
-    steps = (dr.select(square != 0, q / dr.select(square != 0, square, 1), inf),
-             dr.select(q != 0, rate / dr.select(q != 0, q, 1), inf))
+    steps = (
+        dr.select(square != 0, q / dr.select(square != 0, square, 1), inf),
+        dr.select(q != 0, rate / dr.select(q != 0, q, 1), inf),
+    )
     extrema = []
     for step in steps:
         possible = turns & dr.isfinite(step)
         for t in _passings(v, dr.select(possible, step, 0), 0, twist, period):
             extrema.append(dr.select(possible, t, inf))
-    for i, j in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):           # sorting network of four
-        extrema[i], extrema[j] = (dr.minimum(extrema[i], extrema[j]),
-                                  dr.maximum(extrema[i], extrema[j]))
+    for i, j in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):  # sorting network of four
+        extrema[i], extrema[j] = (
+            dr.minimum(extrema[i], extrema[j]),
+            dr.maximum(extrema[i], extrema[j]),
+        )
 
     # g = ±(z − c) starts below zero; the crossing is where it first is not. A ray that starts on
     # the plane starts into the side that it goes to.
@@ -159,11 +163,18 @@ def _bracketed(g, a, b, active):
         m = dr.select((n % 2 == 0) & (gb > ga), dr.clip(secant, a, b), 0.5 * (a + b))
         gm = g(m)
         beyond = gm >= 0
-        return (dr.select(beyond, a, m), dr.select(beyond, m, b),
-                dr.select(beyond, ga, gm), dr.select(beyond, gm, gb), n + 1)
+        return (
+            dr.select(beyond, a, m),
+            dr.select(beyond, m, b),
+            dr.select(beyond, ga, gm),
+            dr.select(beyond, gm, gb),
+            n + 1,
+        )
 
     uint_t = dr.uint32_array_t(type(a))
     _, b, _, _, _ = dr.while_loop(
         (a, b, g(a), g(b), uint_t(0)),
-        lambda a, b, ga, gb, n: active & (n < MAX_STEPS[double]) & (b - a > ulp * b), narrow)
+        lambda a, b, ga, gb, n: active & (n < MAX_STEPS[double]) & (b - a > ulp * b),
+        narrow,
+    )
     return b

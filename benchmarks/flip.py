@@ -10,17 +10,19 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180   # 0.7 m from a screen 0.7 m wide, of 4K
+PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180  # 0.7 m from a screen 0.7 m wide, of 4K
 QC, PC, PT, QF = 0.7, 0.4, 0.95, 0.5
-FEATURE_WIDTH = 0.082                                  # degrees
+FEATURE_WIDTH = 0.082  # degrees
 
 # Sums of Gaussians (a, b): sensitivity to contrast of brightness, red-green and blue-yellow
 CONTRAST = (((1, 0.0047),), ((1, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 
 # Linear sRGB to XYZ, and the white of the screen
-TO_XYZ = ((10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
-          (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
-          (1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382))
+TO_XYZ = (
+    (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
+    (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
+    (1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382),
+)
 WHITE = tuple(sum(row) for row in TO_XYZ)
 
 
@@ -32,8 +34,10 @@ def flip(image, reference):
     """
     shape = image.shape
     if shape != reference.shape or len(shape) != 3 or shape[2] != 3:
-        raise ValueError(f"flip() compares two images of height x width x 3 of one size, and got "
-                         f"{shape} and {reference.shape}.")
+        raise ValueError(
+            f"flip() compares two images of height x width x 3 of one size, and got "
+            f"{shape} and {reference.shape}."
+        )
     size = shape[:2]
     pair = [_opponent([dr.clip(x, 0, 1) for x in _planes(x)]) for x in (image, reference)]
 
@@ -42,8 +46,9 @@ def flip(image, reference):
     largest = _hyab(_hunt_lab((0.0, 1.0, 0.0)), _hunt_lab((0.0, 0.0, 1.0))) ** QC
     distance = dr.power(_hyab(*seen), QC)
     knee = PC * largest
-    colour = dr.select(distance < knee, PT / knee * distance,
-                       PT + (distance - knee) / (largest - knee) * (1 - PT))
+    colour = dr.select(
+        distance < knee, PT / knee * distance, PT + (distance - knee) / (largest - knee) * (1 - PT)
+    )
 
     # Features: edges and points that one image has and the other has not
     luminance = [(x[0] + 16) / 116 for x in pair]
@@ -54,8 +59,10 @@ def flip(image, reference):
 
 
 def _planes(image):
-    return [dr.gather(mi.Float, image.array, 3 * dr.arange(mi.UInt32, len(image.array) // 3) + i)
-            for i in range(3)]
+    return [
+        dr.gather(mi.Float, image.array, 3 * dr.arange(mi.UInt32, len(image.array) // 3) + i)
+        for i in range(3)
+    ]
 
 
 def _opponent(rgb):
@@ -79,8 +86,9 @@ def _hunt_lab(rgb):
     def root(t):
         return dr.select(t > delta**3, dr.cbrt(dr.maximum(t, 1e-9)), t / (3 * delta**2) + 4 / 29)
 
-    x, y, z = (root(sum(m * c for m, c in zip(row, rgb)) / white)
-               for row, white in zip(TO_XYZ, WHITE))
+    x, y, z = (
+        root(sum(m * c for m, c in zip(row, rgb)) / white) for row, white in zip(TO_XYZ, WHITE)
+    )
     lightness = 116 * y - 16
     return lightness, 0.01 * lightness * 500 * (x - y), 0.01 * lightness * 200 * (y - z)
 
@@ -99,8 +107,11 @@ def _convolved(plane, size, weights, axis):
     result = mi.Float(0)
     for i, weight in enumerate(weights):
         shift = i - radius
-        at = (y * width + dr.clip(x + shift, 0, width - 1) if axis
-              else dr.clip(y + shift, 0, height - 1) * width + x)
+        at = (
+            y * width + dr.clip(x + shift, 0, width - 1)
+            if axis
+            else dr.clip(y + shift, 0, height - 1) * width + x
+        )
         result = dr.fma(weight, dr.gather(mi.Float, plane, mi.UInt32(at)), result)
     dr.eval(result)
     return result
@@ -140,7 +151,9 @@ def _features(luminance, size):
         # What rises and what falls counts the same
         rise, fall = sum(w for w in weights if w > 0), -sum(w for w in weights if w < 0)
         weights = [w / (rise if w > 0 else fall) for w in weights]
-        across = [_convolved(_convolved(luminance, size, weights, axis), size, blur, 1 - axis)
-                  for axis in (0, 1)]
+        across = [
+            _convolved(_convolved(luminance, size, weights, axis), size, blur, 1 - axis)
+            for axis in (0, 1)
+        ]
         strengths.append(dr.sqrt(across[0] ** 2 + across[1] ** 2))
     return strengths

@@ -75,13 +75,15 @@ def irradiance(p, n, q, twist, reach):
 #  Images
 # ---------------------------------------------------------------------------
 
+
 def columns(triples, repeat, vector_t=None):
     """Triples as a Dr.Jit vector, each repeated."""
     vector_t = vector_t or mi.Point3f
     value_t = dr.value_t(vector_t)
     index = dr.arange(UInt32, len(triples) * repeat) // repeat
-    return vector_t(*(dr.gather(value_t, value_t([float(t[i]) for t in triples]), index)
-                      for i in range(3)))
+    return vector_t(
+        *(dr.gather(value_t, value_t([float(t[i]) for t in triples]), index) for i in range(3))
+    )
 
 
 def enough_cells(p, q, twist, reach):
@@ -141,8 +143,11 @@ def all_geodesics(p, q, twist, reach):
     # v = 0 itself is no root: the excess starts with −ζ v² there
     crossing = (excess(dr.maximum(v, 1e-9), r, zeta) < 0) != (excess(b, r, zeta) < 0)
     keep = dr.compress(crossing)
-    index, a, b = dr.gather(UInt32, index, keep), dr.gather(Float64, v, keep), \
-        dr.gather(Float64, b, keep)
+    index, a, b = (
+        dr.gather(UInt32, index, keep),
+        dr.gather(Float64, v, keep),
+        dr.gather(Float64, b, keep),
+    )
     a = dr.maximum(a, 1e-9)
     azimuth, r, zeta = terms(index)
     orientation = dr.select(zeta < 0, Float64(-1), 1)
@@ -158,11 +163,15 @@ def all_geodesics(p, q, twist, reach):
     distance = dr.hypot(horizontal, 2 * v / abs(twist))
     angle = azimuth - orientation * v
     c = horizontal / distance
-    direction = Array3f64(c * dr.cos(angle), c * dr.sin(angle),
-                          orientation * 2 * v / (twist * distance))
+    direction = Array3f64(
+        c * dr.cos(angle), c * dr.sin(angle), orientation * 2 * v / (twist * distance)
+    )
     keep = dr.compress(distance <= reach)
-    return (dr.gather(UInt32, index, keep), dr.gather(Array3f64, direction, keep),
-            dr.gather(Float64, distance, keep))
+    return (
+        dr.gather(UInt32, index, keep),
+        dr.gather(Array3f64, direction, keep),
+        dr.gather(Float64, distance, keep),
+    )
 
 
 def sum_over_images(p, n, q, twist, reach):

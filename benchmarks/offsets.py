@@ -51,7 +51,8 @@ def sphere_mesh(n, middle, size):
     mesh = mi.Mesh("sphere", (n + 1) ** 2, 2 * n * n)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = dr.ravel(
-        dr.fma(size, mi.Point3f(s * cp, s * sp, c), mi.Point3f(*middle)))
+        dr.fma(size, mi.Point3f(s * cp, s * sp, c), mi.Point3f(*middle))
+    )
     square = dr.arange(mi.UInt32, n * n)
     first = square + square // n
     faces = dr.zeros(mi.UInt32, 6 * n * n)
@@ -68,10 +69,14 @@ def cylinder(middle, size):
     at = to(middle, 0.8 * size)
     T = mi.ScalarTransform4f()
     ends = {f"p{i}": at @ mi.ScalarPoint3f(0, 0, z) for i, z in enumerate((-0.6, 0.6))}
-    return {"side": {"type": "cylinder", "radius": 0.8 * size, **ends},
-            "top": {"type": "disk", "to_world": at @ T.translate([0, 0, 0.6])},
-            "bottom": {"type": "disk",
-                       "to_world": at @ T.translate([0, 0, -0.6]).rotate([1, 0, 0], 180)}}
+    return {
+        "side": {"type": "cylinder", "radius": 0.8 * size, **ends},
+        "top": {"type": "disk", "to_world": at @ T.translate([0, 0, 0.6])},
+        "bottom": {
+            "type": "disk",
+            "to_world": at @ T.translate([0, 0, -0.6]).rotate([1, 0, 0], 180),
+        },
+    }
 
 
 def rectangles(middle, size):
@@ -79,8 +84,13 @@ def rectangles(middle, size):
     T = mi.ScalarTransform4f()
     turns = [([1, 0, 0], angle) for angle in (0, 90, 180, 270)]
     turns += [([0, 1, 0], angle) for angle in (90, 270)]
-    return {f"side{i}": {"type": "rectangle", "to_world": to(middle, 0.5 * size)
-                         @ T.rotate(*turn).translate([0, 0, 1])} for i, turn in enumerate(turns)}
+    return {
+        f"side{i}": {
+            "type": "rectangle",
+            "to_world": to(middle, 0.5 * size) @ T.rotate(*turn).translate([0, 0, 1]),
+        }
+        for i, turn in enumerate(turns)
+    }
 
 
 def instance(child, middle, size, lift=0.0):
@@ -89,9 +99,14 @@ def instance(child, middle, size, lift=0.0):
     T = mi.ScalarTransform4f()
     if isinstance(child, dict):
         child = child | {"to_world": T.translate(there)}
-    return {"group": {"type": "shapegroup", "child": child},
-            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"},
-                         "to_world": to(middle, size) @ T.translate([-c for c in there])}}
+    return {
+        "group": {"type": "shapegroup", "child": child},
+        "instance": {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": to(middle, size) @ T.translate([-c for c in there]),
+        },
+    }
 
 
 def curve(kind, middle, size):
@@ -113,8 +128,9 @@ KINDS = {
     "instance of a mesh": lambda c, r: instance(sphere_mesh(100, (0, 0, 0), 1.0), c, r),
     "instance of a mesh, 9 off": lambda c, r: instance({"type": "cube"}, c, 0.5 * r, 9.0),
     "instance of a sphere": lambda c, r: instance({"type": "sphere"}, c, r),
-    "the same, scaled by 1/30": lambda c, r: instance({"type": "sphere", "radius": 30 * r}, c,
-                                                      1 / 30),
+    "the same, scaled by 1/30": lambda c, r: instance(
+        {"type": "sphere", "radius": 30 * r}, c, 1 / 30
+    ),
     "linearcurve": lambda c, r: curve("linearcurve", c, r),
     "bsplinecurve": lambda c, r: curve("bsplinecurve", c, r),
 }
@@ -157,8 +173,9 @@ class Hits:
         """The package's margin, or one of so many roundings."""
         if roundings is None:
             return self.table.margin(self.si, self.si.t)
-        with mock.patch.multiple("nil_mitsuba.shapes", ROUNDINGS=roundings,
-                                 OTHER_ROUNDINGS=roundings):
+        with mock.patch.multiple(
+            "nil_mitsuba.shapes", ROUNDINGS=roundings, OTHER_ROUNDINGS=roundings
+        ):
             return self.table.margin(self.si, self.si.t)
 
     def wrong(self, margin=None):
@@ -169,16 +186,18 @@ class Hits:
             if margin is None:
                 rays.append(self.si.spawn_ray(side * self.d))
             else:
-                rays.append(mi.Ray3f(self.si.p + mi.Vector3f(self.si.n) * (side * margin),
-                                     side * self.d))
+                rays.append(
+                    mi.Ray3f(self.si.p + mi.Vector3f(self.si.n) * (side * margin), side * self.d)
+                )
         out, into = (self.scene.ray_test(ray, self.valid) for ray in rays)
         return dr.count(self.valid & out)[0], dr.count(self.valid & ~into)[0]
 
 
 def leaking_paths(twist, size=256, spp=16, depth=10):
     """(pixels too dark or bright, vertices) of a glowing room of 12 triangles."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0], size),
-                          **cube_room()})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0], size), **cube_room()}
+    )
     image = mi.render(scene, integrator=nil(twist, False, depth), spp=spp)
     exact = EMISSION * (1 - ALBEDO**depth) / (1 - ALBEDO)
     off = dr.abs(image.array / exact - 1) > ROUNDING
@@ -188,12 +207,16 @@ def leaking_paths(twist, size=256, spp=16, depth=10):
 def unequal_glass(twist, size=1024):
     """(paths whose radiance is off, paths) through balls of glass under a white sky."""
     glass = {"type": "dielectric"}
-    scene = mi.load_dict({
-        "type": "scene", "sensor": sensor([4, 0, 0], [0, 0, 0], size),
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}},
-        "a": {"type": "sphere", "radius": 1.2, "bsdf": glass},
-        "b": {"type": "sphere", "center": [0, 1.8, 0.2], "radius": 0.5, "bsdf": glass},
-        "c": {"type": "sphere", "center": [0.5, -1.5, -0.3], "radius": 0.3, "bsdf": glass}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor([4, 0, 0], [0, 0, 0], size),
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}},
+            "a": {"type": "sphere", "radius": 1.2, "bsdf": glass},
+            "b": {"type": "sphere", "center": [0, 1.8, 0.2], "radius": 0.5, "bsdf": glass},
+            "c": {"type": "sphere", "center": [0.5, -1.5, -0.3], "radius": 0.3, "bsdf": glass},
+        }
+    )
     image = mi.render(scene, integrator=nil(twist, False, 40), spp=1).array
     # What ``max_depth`` ends is black
     off = (image != 0) & (dr.abs(image / 0.7 - 1) > ROUNDING)
@@ -210,8 +233,11 @@ def main():
     mi.set_variant("llvm_ad_rgb")
     quick = parser.parse_args().quick
     count = 1000 if quick else COUNT
-    print("| shape | where | hits | package | " + " | ".join(f"{n} roundings" for n in ROUNDINGS)
-          + " | spawn_ray |")
+    print(
+        "| shape | where | hits | package | "
+        + " | ".join(f"{n} roundings" for n in ROUNDINGS)
+        + " | spawn_ray |"
+    )
     print("|---" * (5 + len(ROUNDINGS)) + "|")
     cases = [(kind, *place) for kind in KINDS for place in PLACES]
     cases += [("sphere", f"radius {r:g}", (0.5, 0.6, 0.3), r) for r in SPHERE_RADII]
@@ -221,8 +247,10 @@ def main():
         shares = []
         for margin in margins:
             out, into = hits.wrong(margin)
-            shares.append(share(out, len(hits)) + (
-                "" if kind in ONE_SIDED else f" / {share(into, len(hits))}"))
+            shares.append(
+                share(out, len(hits))
+                + ("" if kind in ONE_SIDED else f" / {share(into, len(hits))}")
+            )
         print(f"| {kind} | {where} | {len(hits):,} | " + " | ".join(shares) + " |", flush=True)
 
     print("\n| twist | pixels off in a closed room | of vertices | paths off behind glass | of |")

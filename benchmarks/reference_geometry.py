@@ -20,6 +20,7 @@ mp.dps = 75
 #  Truth
 # ---------------------------------------------------------------------------
 
+
 def _circle_functions(u):
     if u == 0:
         return mpf(1), mpf(0), mpf(0)
@@ -32,26 +33,26 @@ def flow(p, v, t, k):
     (x, y, z), (a, b, w), t, k = map(mpf, p), map(mpf, v), mpf(t), mpf(k)
     u = k * w * t
     S, C, Q = _circle_functions(u)
-    X, Y = t * (a*S - b*C), t * (b*S + a*C)
-    Z = w*t + k * (a*a + b*b) * t*t * Q / 2 + k*X*Y / 2
+    X, Y = t * (a * S - b * C), t * (b * S + a * C)
+    Z = w * t + k * (a * a + b * b) * t * t * Q / 2 + k * X * Y / 2
     cos_u, sin_u = mp.cos(u), mp.sin(u)
-    return ((x + X, y + Y, z + Z + k*x*Y), (a*cos_u - b*sin_u, b*cos_u + a*sin_u, w))
+    return ((x + X, y + Y, z + Z + k * x * Y), (a * cos_u - b * sin_u, b * cos_u + a * sin_u, w))
 
 
 @cache
 def area_density(t, w, k):
     """Jacobian of the exponential map by differences of ``flow``, without the closed form of A."""
     t, w, k = mpf(t), mpf(w), mpf(k)
-    c = mp.sqrt(1 - w*w)
+    c = mp.sqrt(1 - w * w)
     v, e1, e2 = (c, mpf(0), w), (-w, mpf(0), c), (mpf(0), mpf(-1), mpf(0))
-    h = mpf(10)**-20
+    h = mpf(10) ** -20
     (x, _, _), end = flow((0, 0, 0), v, t, k)
     rows = []
     for e in (e1, e2):
-        (xp, yp, zp), _ = flow((0, 0, 0), tuple(i + h*j for i, j in zip(v, e)), t, k)
-        (xm, ym, zm), _ = flow((0, 0, 0), tuple(i - h*j for i, j in zip(v, e)), t, k)
-        dx, dy, dz = ((i - j) / (2*h) for i, j in ((xp, xm), (yp, ym), (zp, zm)))
-        rows.append((dx, dy, dz - k*x*dy))
+        (xp, yp, zp), _ = flow((0, 0, 0), tuple(i + h * j for i, j in zip(v, e)), t, k)
+        (xm, ym, zm), _ = flow((0, 0, 0), tuple(i - h * j for i, j in zip(v, e)), t, k)
+        dx, dy, dz = ((i - j) / (2 * h) for i, j in ((xp, xm), (yp, ym), (zp, zm)))
+        rows.append((dx, dy, dz - k * x * dy))
     return mp.det(mp.matrix([rows[0], rows[1], end]))
 
 
@@ -61,14 +62,14 @@ def connect(p, q, k):
     (px, py, pz), (qx, qy, qz), k = map(mpf, p), map(mpf, q), mpf(k)
     x, y = qx - px, qy - py
     z = qz - pz - k * px * y - k * x * y / 2
-    r = mp.sqrt(x*x + y*y)
+    r = mp.sqrt(x * x + y * y)
     if k == 0:
         v, horizontal, vertical = mpf(0), r, z
     else:
         zeta, R = abs(k * z), abs(k) * r / 2
         if R == 0 and zeta > 2 * mp.pi:
             v = mp.pi
-            horizontal = 2 * v / abs(k) * mp.sqrt((zeta - 2*mp.pi) / mp.pi)
+            horizontal = 2 * v / abs(k) * mp.sqrt((zeta - 2 * mp.pi) / mp.pi)
         else:
             v = zeta / 2 if R == 0 else _half_turn(R, zeta)
             horizontal = r * v / mp.sin(v) if v else r
@@ -81,8 +82,11 @@ def connect(p, q, k):
     # On a fibre the geodesic that starts at azimuth 0
     azimuth = mp.atan2(y, x) if r else v
     c, w = horizontal / distance, vertical / distance
-    return ((c * mp.cos(azimuth - v), c * mp.sin(azimuth - v), w),
-            (c * mp.cos(azimuth + v), c * mp.sin(azimuth + v), w), distance)
+    return (
+        (c * mp.cos(azimuth - v), c * mp.sin(azimuth - v), w),
+        (c * mp.cos(azimuth + v), c * mp.sin(azimuth + v), w),
+        distance,
+    )
 
 
 def _half_turn(R, zeta):
@@ -91,19 +95,19 @@ def _half_turn(R, zeta):
 
     def mismatch(v):
         s, c = mp.sin(v), mp.cos(v)
-        return 2*v + R*R * (v - s*c) / (s*s) - zeta
+        return 2 * v + R * R * (v - s * c) / (s * s) - zeta
 
     # From whichever end of (0, π) is nearer, as the root may crowd either: for v or for π − v
     middle = mp.pi / 2
     rising = mismatch(middle) > 0
     # There μ(v) ≤ v, or μ(v) ≥ π/2 / (π − v)²
-    a, b = zeta / (3 + R*R) if rising else R * mp.sqrt(mp.pi / (2*zeta)), middle
+    a, b = zeta / (3 + R * R) if rising else R * mp.sqrt(mp.pi / (2 * zeta)), middle
 
     def unknown(x):
         return x if rising else mp.pi - x
 
-    while b - a > mpf(10)**-5 * a:
-        m = mp.sqrt(a*b)
+    while b - a > mpf(10) ** -5 * a:
+        m = mp.sqrt(a * b)
         if (mismatch(unknown(m)) > 0) == rising:
             b = m
         else:
@@ -113,16 +117,16 @@ def _half_turn(R, zeta):
     for _ in range(4):
         v = unknown(x)
         s, c = mp.sin(v), mp.cos(v)
-        step = mismatch(v) / (2 + 2*R*R * (s - v*c) / s**3)
+        step = mismatch(v) / (2 + 2 * R * R * (s - v * c) / s**3)
         x = x - step if rising else x + step
     return unknown(x)
 
 
 def metric(x, k):
     """Coordinate metric of ds² = dx² + dy² + (dz − k x dy)², its inverse and ∂ of it along x."""
-    g = ((1, 0, 0), (0, 1 + (k*x)**2, -k*x), (0, -k*x, 1))
-    g_inv = ((1, 0, 0), (0, 1, k*x), (0, k*x, 1 + (k*x)**2))
-    dg_dx = ((0, 0, 0), (0, 2*k*k*x, -k), (0, -k, 0))
+    g = ((1, 0, 0), (0, 1 + (k * x) ** 2, -k * x), (0, -k * x, 1))
+    g_inv = ((1, 0, 0), (0, 1, k * x), (0, k * x, 1 + (k * x) ** 2))
+    dg_dx = ((0, 0, 0), (0, 2 * k * k * x, -k), (0, -k, 0))
     return g, g_inv, dg_dx
 
 
@@ -133,8 +137,16 @@ def christoffel(x, k):
     def d(m, j, l):
         return dg_dx[j][l] if m == 0 else 0
 
-    return [[[sum(g_inv[i][m] * (d(j, m, l) + d(l, m, j) - d(m, j, l)) for m in range(3)) / 2
-              for l in range(3)] for j in range(3)] for i in range(3)]
+    return [
+        [
+            [
+                sum(g_inv[i][m] * (d(j, m, l) + d(l, m, j) - d(m, j, l)) for m in range(3)) / 2
+                for l in range(3)
+            ]
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
 
 
 def integrate(p, v, t, k, step=0.2):
@@ -144,30 +156,32 @@ def integrate(p, v, t, k, step=0.2):
     def rate(s):
         gamma = christoffel(s[0], k)
         u = s[3:]
-        return u + [-sum(gamma[i][j][l] * u[j] * u[l] for j in range(3) for l in range(3)
-                         if gamma[i][j][l]) for i in range(3)]
+        return u + [
+            -sum(gamma[i][j][l] * u[j] * u[l] for j in range(3) for l in range(3) if gamma[i][j][l])
+            for i in range(3)
+        ]
 
     def midpoint(s, H, n):
         h = H / n
-        before, now = s, [i + h*j for i, j in zip(s, rate(s))]
+        before, now = s, [i + h * j for i, j in zip(s, rate(s))]
         for _ in range(n - 1):
-            before, now = now, [i + 2*h*j for i, j in zip(before, rate(now))]
-        return [(i + j + h*l) / 2 for i, j, l in zip(before, now, rate(now))]
+            before, now = now, [i + 2 * h * j for i, j in zip(before, rate(now))]
+        return [(i + j + h * l) / 2 for i, j, l in zip(before, now, rate(now))]
 
     steps = max(1, round(abs(t) / step))
     H = t / steps
     counts = (2, 4, 6, 8, 10, 12)
     for _ in range(steps):
         table = []
-        for n in counts:                            # Gragg, Bulirsch and Stoer: powers of h²
+        for n in counts:  # Gragg, Bulirsch and Stoer: powers of h²
             row = [midpoint(state, H, n)]
-            for j, m in enumerate(reversed(counts[:len(table)])):
-                ratio = (n / m)**2 - 1
+            for j, m in enumerate(reversed(counts[: len(table)])):
+                ratio = (n / m) ** 2 - 1
                 row.append([i + (i - l) / ratio for i, l in zip(row[j], table[-1][j])])
             table.append(row)
         state = table[-1][-1]
     x, y, z, a, b, dz = state
-    return (x, y, z), (a, b, dz - k*x*b)
+    return (x, y, z), (a, b, dz - k * x * b)
 
 
 # ---------------------------------------------------------------------------
@@ -179,8 +193,8 @@ TWISTS = (-3, -2, -1, -0.5, -1e-6, 0, 1e-6, 1e-3, 0.375, 1, 2, 3)
 
 def unit(a, b, w):
     """The direction with azimuth of (a, b) and exactly the fibre component w."""
-    c = sqrt(1 - w*w) / hypot(a, b)
-    return a*c, b*c, w
+    c = sqrt(1 - w * w) / hypot(a, b)
+    return a * c, b * c, w
 
 
 def flow_cases(t_max, seed=1):
@@ -203,13 +217,17 @@ def flow_cases(t_max, seed=1):
 def area_cases(seed=2):
     """(t, w, k) with |k w t/2| ≤ 3."""
     rng = random.Random(seed)
-    cases = [(t, w, k) for k in TWISTS for t in (0.01, 1, 2.5, 20)
-             for w in (0, 1e-12, -1e-7, 1e-3, 0.25, -1, 0.999)]
+    cases = [
+        (t, w, k)
+        for k in TWISTS
+        for t in (0.01, 1, 2.5, 20)
+        for w in (0, 1e-12, -1e-7, 1e-3, 0.25, -1, 0.999)
+    ]
     for _ in range(300):
         k, v = rng.choice(TWISTS), rng.uniform(-3, 3)
         w = rng.uniform(-1, 1)
-        cases.append((min(50, abs(2*v / (k*w))) if k else 5, w, k))
-    return [(t, w, k) for t, w, k in cases if abs(k*w*t) / 2 <= 3]
+        cases.append((min(50, abs(2 * v / (k * w))) if k else 5, w, k))
+    return [(t, w, k) for t, w, k in cases if abs(k * w * t) / 2 <= 3]
 
 
 def connect_cases(seed=3):
@@ -219,26 +237,27 @@ def connect_cases(seed=3):
     cases = []
     for k in TWISTS:
         heights = [0, 1e-7, 1e-3, 0.5, 3, 7, 20, 50]
-        if abs(2*pi / (k or 1e-9)) < 49:
-            fibre = 2*pi / abs(k)
+        if abs(2 * pi / (k or 1e-9)) < 49:
+            fibre = 2 * pi / abs(k)
             heights += [fibre, fibre * (1 + 2e-5), fibre * (1 - 2e-5), fibre * 1.01, fibre * 0.99]
         for r, height in product(radii, heights):
             azimuth = rng.uniform(-pi, pi)
             cases.append((r, azimuth, rng.choice((-1, 1)) * height, k))
         for _ in range(20):
             cases.append((rng.uniform(0, 50), rng.uniform(-pi, pi), rng.uniform(-50, 50), k))
-            cases.append((10**rng.uniform(-7, 1), rng.uniform(-pi, pi), rng.uniform(-50, 50), k))
+            cases.append((10 ** rng.uniform(-7, 1), rng.uniform(-pi, pi), rng.uniform(-50, 50), k))
     result = []
     for r, azimuth, height, k in cases:
         e = mp.expjpi(azimuth / pi)
         x, y = r * float(e.real), r * float(e.imag)
-        result.append(((x, y, height + k*x*y / 2), k))
+        result.append(((x, y, height + k * x * y / 2), k))
     return result
 
 
 # ---------------------------------------------------------------------------
 #  Comparison: all cases in one call of the package
 # ---------------------------------------------------------------------------
+
 
 def _numbers(array):
     return list(array) if dr.is_jit_v(array) else [array]
@@ -276,7 +295,7 @@ def evaluate(vector_t, function, *columns):
 
 
 def norm(a):
-    return mp.sqrt(sum(i*i for i in a))
+    return mp.sqrt(sum(i * i for i in a))
 
 
 def difference(a, b):
@@ -297,24 +316,32 @@ def flow_errors(geometry, vector_t, cases):
     for (p, v, t, k), (end, direction) in zip(rows, results):
         true_end, true_direction = flow(p, v, t, k)
         scale = max(1, abs(k) / 2)
-        errors.append((difference(end, true_end) / size(p, true_end) / scale,
-                       difference(direction, true_direction) / scale, (p, v, t, k)))
+        errors.append(
+            (
+                difference(end, true_end) / size(p, true_end) / scale,
+                difference(direction, true_direction) / scale,
+                (p, v, t, k),
+            )
+        )
     return errors
 
 
 def area_errors(geometry, vector_t, cases):
     """[(relative error, case)]."""
-    rows, results = evaluate(vector_t, lambda t, w, k: (geometry.area_density(t, w, k),),
-                             *zip(*cases))
-    return [(difference(area, (true,)) / abs(true), case) for case, area, true in
-            zip(rows, results, (area_density(*row) for row in rows))]
+    rows, results = evaluate(
+        vector_t, lambda t, w, k: (geometry.area_density(t, w, k),), *zip(*cases)
+    )
+    return [
+        (difference(area, (true,)) / abs(true), case)
+        for case, area, true in zip(rows, results, (area_density(*row) for row in rows))
+    ]
 
 
 def is_ill_conditioned(q, k, margin):
     """Within ``margin`` of |ζ| = 2π on or near the axis, here a tenth of the circle's radius."""
     x, y, z = map(mpf, q)
-    zeta, R = abs(k * (z - k*x*y/2)), abs(k) * mp.sqrt(x*x + y*y) / 2
-    return R < 0.1 and abs(zeta - 2*mp.pi) < margin
+    zeta, R = abs(k * (z - k * x * y / 2)), abs(k) * mp.sqrt(x * x + y * y) / 2
+    return R < 0.1 and abs(zeta - 2 * mp.pi) < margin
 
 
 def connect_errors(geometry, vector_t, cases, margin):
@@ -324,6 +351,7 @@ def connect_errors(geometry, vector_t, cases, margin):
     density, relative like the distance, where |k w T/2| > 3. Landing: how far from the point
     ``flow`` ends along the result, relative as for ``flow``.
     """
+
     def both_ways(q, k):
         origin = dr.zeros(vector_t)
         c = geometry.connect(origin, q, k)
@@ -341,8 +369,12 @@ def connect_errors(geometry, vector_t, cases, margin):
         elif not is_ill_conditioned(q, k, margin):
             true_direction, true_arrival, true_distance = truth
             w = true_direction[2]
-            error = (abs(distance / true_distance - 1), difference(direction, true_direction),
-                     difference(arrival, true_arrival), None)
+            error = (
+                abs(distance / true_distance - 1),
+                difference(direction, true_direction),
+                difference(arrival, true_arrival),
+                None,
+            )
             if abs(k * w * true_distance) / 2 <= 3 and abs(w) < 1:
                 error = *error[:3], abs(area / area_density(true_distance, w, k) - 1)
         errors.append((*error, landing, (q, k)))
@@ -355,7 +387,7 @@ def worst(errors, column):
     return max(((e[column], e[-1]) for e in known), key=lambda e: e[0])
 
 
-LIMITS = {       # 32 bit, 64 bit
+LIMITS = {  # 32 bit, 64 bit
     "flow, t ≤ 5": (2e-6, 1e-13),
     "flow, t ≤ 20": (1e-5, 1e-12),
     "area_density": (2e-5, 1e-12),
@@ -367,8 +399,10 @@ ILL_CONDITIONED = (1e-4, 1e-9)
 def main():
     from nil_mitsuba import geometry
 
-    for name, vector_t in (("LLVM", (dr.llvm.Array3f, dr.llvm.Array3f64)),
-                           ("scalar", (dr.scalar.Array3f, dr.scalar.Array3f64))):
+    for name, vector_t in (
+        ("LLVM", (dr.llvm.Array3f, dr.llvm.Array3f64)),
+        ("scalar", (dr.scalar.Array3f, dr.scalar.Array3f64)),
+    ):
         for bits, double in ((32, 0), (64, 1)):
             array_t = vector_t[double]
             table = []
@@ -376,15 +410,18 @@ def main():
                 errors = flow_errors(geometry, array_t, flow_cases(t_max))
                 for i, what in enumerate(("point", "direction")):
                     table.append((f"flow, t ≤ {t_max}", what, worst(errors, i)))
-            table.append(("area_density", "", worst(area_errors(geometry, array_t, area_cases()),
-                                                    0)))
+            table.append(
+                ("area_density", "", worst(area_errors(geometry, array_t, area_cases()), 0))
+            )
             errors = connect_errors(geometry, array_t, connect_cases(), ILL_CONDITIONED[double])
             for i, what in enumerate(("distance", "direction", "arrival", "area", "landing")):
                 table.append(("connect", what, worst(errors, i)))
             print(f"{name}, {bits} bit")
             for function, what, (error, case) in table:
-                print(f"  {function:14}{what:10} {float(error):8.1e}  (limit "
-                      f"{LIMITS[function][double]:.0e})  at {case}")
+                print(
+                    f"  {function:14}{what:10} {float(error):8.1e}  (limit "
+                    f"{LIMITS[function][double]:.0e})  at {case}"
+                )
 
 
 if __name__ == "__main__":

@@ -27,9 +27,12 @@ def geodesic(p, v, t, twist=1):
     y = -c / omega * (cos_t - cos_0)
     # sin 2φ = 2 sin φ cos φ
     z = v.z * t + twist * dr.square(c) / omega * (
-        0.5 * t - (sin_t * cos_t - sin_0 * cos_0) / (2 * omega) + sin_0 * (cos_t - cos_0) / omega)
-    return (type(p)(geometry.multiply(p, type(p)(x, y, z), twist)),
-            type(v)(c * cos_t, c * sin_t, v.z))
+        0.5 * t - (sin_t * cos_t - sin_0 * cos_0) / (2 * omega) + sin_0 * (cos_t - cos_0) / omega
+    )
+    return (
+        type(p)(geometry.multiply(p, type(p)(x, y, z), twist)),
+        type(v)(c * cos_t, c * sin_t, v.z),
+    )
 
 
 def crossing_of_x(p, v, c):

@@ -26,7 +26,10 @@ def bent_box(width, rfilter="gaussian", **properties):
     scene["sensor"]["film"]["rfilter"] = {"type": rfilter}
     scene["sensor"]["film"]["width"] = scene["sensor"]["film"]["height"] = width
     scene["integrator"] = {
-        "type": "nil", "max_depth": 6, "quotient": False, "cell_size": 2.0,
+        "type": "nil",
+        "max_depth": 6,
+        "quotient": False,
+        "cell_size": 2.0,
         "cell_origin": mi.ScalarPoint3f(-1, -1, -1),
     } | properties
     return mi.load_dict(scene)
@@ -65,19 +68,27 @@ def against_path(width, spp, rounds):
         ratios = sorted(t / p for t, p in zip(times[name], times["path"]))
         mean = sum(means[name]) / rounds
         error = math.sqrt(sum((m - mean) ** 2 for m in means[name]) / max(1, rounds - 1) / rounds)
-        print(f"{name:30} {ratios[len(ratios) // 2]:6.2f} times path   "
-              f"mean {mean:.5f} ± {error:.5f}")
+        print(
+            f"{name:30} {ratios[len(ratios) // 2]:6.2f} times path   mean {mean:.5f} ± {error:.5f}"
+        )
 
 
 def first_render():
     """Seconds that a first render takes where no kernel was kept from earlier ones."""
-    code = ("import time\nfrom benchmarks import speed\nscene = speed.bent_box(64)\n"
-            "start = time.perf_counter()\nspeed.seconds(scene, 1, 0)\n"
-            "print(time.perf_counter() - start)")
+    code = (
+        "import time\nfrom benchmarks import speed\nscene = speed.bent_box(64)\n"
+        "start = time.perf_counter()\nspeed.seconds(scene, 1, 0)\n"
+        "print(time.perf_counter() - start)"
+    )
     with tempfile.TemporaryDirectory() as home:  # Dr.Jit keeps its kernels below it
-        run = subprocess.run([sys.executable, "-c", code], cwd=pathlib.Path(__file__).parents[1],
-                             env=os.environ | {"HOME": home}, capture_output=True, text=True,
-                             check=True)
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=pathlib.Path(__file__).parents[1],
+            env=os.environ | {"HOME": home},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     print(f"first render, compilation included: {float(run.stdout):.1f} s")
 
 
@@ -102,9 +113,12 @@ def pixels_off(width, spp):
         count = dr.width(z)
         limit = NormalDist().inv_cdf(1 - 0.05 / 2 / count)
         off = dr.count(dr.abs(z) > limit)[0]
-        print(f"squares of {size}x{size} pixels off at {spp} spp: {off} of {count} beyond "
-              f"|z| = {limit:.2f}; largest {dr.max(dr.abs(z))[0]:.2f}, "
-              f"rms {math.sqrt(dr.mean(z * z)[0]):.3f}", flush=True)
+        print(
+            f"squares of {size}x{size} pixels off at {spp} spp: {off} of {count} beyond "
+            f"|z| = {limit:.2f}; largest {dr.max(dr.abs(z))[0]:.2f}, "
+            f"rms {math.sqrt(dr.mean(z * z)[0]):.3f}",
+            flush=True,
+        )
 
 
 def square_sums(values, width, size):
@@ -118,17 +132,22 @@ def square_sums(values, width, size):
 
 def bumpy_scene(triangles, **properties):
     """A wavy sphere in the quotient under an even sky."""
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "nil", "max_depth": 4} | properties,
-        "sensor": {
-            "type": "perspective", "fov": 70,
-            "to_world": mi.ScalarTransform4f().look_at([0.5, 0.05, 0.6], [0.5, 1, 0.4], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 128, "height": 128},
-        },
-        "sky": {"type": "constant"},
-        "mesh": bumpy_sphere(round(math.sqrt(triangles / 2))),
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nil", "max_depth": 4} | properties,
+            "sensor": {
+                "type": "perspective",
+                "fov": 70,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    [0.5, 0.05, 0.6], [0.5, 1, 0.4], [0, 0, 1]
+                ),
+                "film": {"type": "hdrfilm", "width": 128, "height": 128},
+            },
+            "sky": {"type": "constant"},
+            "mesh": bumpy_sphere(round(math.sqrt(triangles / 2))),
+        }
+    )
 
 
 def against_triangles(sizes):
@@ -156,8 +175,11 @@ def against_straight(triangles, depths, spp, rounds):
             cost = {t: seconds(scene, spp, seed)[0] / lengths[t] for t, scene in scenes.items()}
             ratios.append(cost[1] / cost[0])
         middle = sorted(ratios[1:])[rounds // 2]  # the first one compiles
-        print(f"max_depth {depth}   {middle:.2f}   mean length of a ray at twist 1: "
-              f"{lengths[1]:.2f} cells", flush=True)
+        print(
+            f"max_depth {depth}   {middle:.2f}   mean length of a ray at twist 1: "
+            f"{lengths[1]:.2f} cells",
+            flush=True,
+        )
 
 
 def traced_length(scene):
@@ -192,16 +214,23 @@ def against_extent(halves, spp, rounds):
         ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half)}
         times = {}
         for integrator in ({"type": "path"}, {"type": "nil", "quotient": False}):
-            scene = mi.load_dict({
-                "type": "scene", "integrator": integrator, "sky": {"type": "constant"},
-                "sensor": {"type": "perspective", "to_world": look, "film": film},
-                "ground": ground,
-                "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
-            })
+            scene = mi.load_dict(
+                {
+                    "type": "scene",
+                    "integrator": integrator,
+                    "sky": {"type": "constant"},
+                    "sensor": {"type": "perspective", "to_world": look, "film": film},
+                    "ground": ground,
+                    "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
+                }
+            )
             times[integrator["type"]] = [seconds(scene, spp, seed)[0] for seed in range(rounds + 1)]
         ratios = sorted(n / p for n, p in zip(times["nil"][1:], times["path"][1:]))
-        print(f"{half:9,.0f}   {ratios[rounds // 2]:.1f}   "
-              f"({1e6 * min(times['nil']) / (64 * 64 * spp):.2f} µs a path)", flush=True)
+        print(
+            f"{half:9,.0f}   {ratios[rounds // 2]:.1f}   "
+            f"({1e6 * min(times['nil']) / (64 * 64 * spp):.2f} µs a path)",
+            flush=True,
+        )
 
 
 def bumpy_sphere(n):
@@ -236,8 +265,10 @@ def memory(width):
     seconds(scene, 1, 0)
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     added = (after - before) / 1024 * 1e6 / width**2
-    print(f"\npeak memory per million pixels of one sample: {added:.0f} MiB "
-          f"(process: {after / 1024:.0f} MiB)")
+    print(
+        f"\npeak memory per million pixels of one sample: {added:.0f} MiB "
+        f"(process: {after / 1024:.0f} MiB)"
+    )
 
 
 if __name__ == "__main__":

@@ -28,10 +28,17 @@ def load(width, height, layers=""):
     """The scene and its integrator with layers."""
     scene = mi.load_file(SCENE, resx=width, resy=height)
     own = scene.integrator()
-    return scene, mi.load_dict({
-        "type": "nil", "aovs": layers, "twist": own.twist, "quotient": own.quotient,
-        "cell_origin": own.cell_origin, "cell_size": own.cell_size, "max_depth": 4,
-    })
+    return scene, mi.load_dict(
+        {
+            "type": "nil",
+            "aovs": layers,
+            "twist": own.twist,
+            "quotient": own.quotient,
+            "cell_origin": own.cell_origin,
+            "cell_size": own.cell_size,
+            "max_depth": 4,
+        }
+    )
 
 
 def processor_seconds(work):
@@ -77,6 +84,7 @@ def passes(repeats, size, total, samples):
 
 def layers(repeats, size):
     """A pass with all layers against one with none."""
+
     def work(names):
         scene, integrator = load(*size, names)
         still = stills.Still(scene, 0, integrator, 0, stills.Rules(16), scene_hash="")
@@ -110,9 +118,26 @@ def peak_memory(spp):
     )
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
-            [sys.executable, "-c", code, "render", SCENE, "-D", "resx=480", "-D", "resy=270",
-             "-P", "max_depth=4", "--spp", str(spp), "-o", os.path.join(folder, "a.exr")],
-            capture_output=True, text=True, check=True,
+            [
+                sys.executable,
+                "-c",
+                code,
+                "render",
+                SCENE,
+                "-D",
+                "resx=480",
+                "-D",
+                "resy=270",
+                "-P",
+                "max_depth=4",
+                "--spp",
+                str(spp),
+                "-o",
+                os.path.join(folder, "a.exr"),
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
         )
     return float(run.stdout.split()[-1])
 
@@ -120,8 +145,13 @@ def peak_memory(spp):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--samples", type=int, nargs="+", default=[16, 64, 256],
-                        help="samples per pixel at which memory is measured")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        nargs="+",
+        default=[16, 64, 256],
+        help="samples per pixel at which memory is measured",
+    )
     parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
     arguments = parser.parse_args()
     if arguments.quick:
@@ -134,21 +164,28 @@ def main():
         print(f"  {spp:5d} spp: {peak_memory(spp):.0f} MiB")
     from nil_mitsuba.passes import WAVEFRONT_SAMPLES
 
-    shrink, size, film = (1024, (64, 32), (192, 108)) if arguments.quick else (
-        1, (512, 256), (1920, 1080))
+    shrink, size, film = (
+        (1024, (64, 32), (192, 108)) if arguments.quick else (1, (512, 256), (1920, 1080))
+    )
     total = 4 * WAVEFRONT_SAMPLES // shrink
     for name, function, *of in (
         ("passes against a single one", passes, total, WAVEFRONT_SAMPLES // shrink),
-        ("passes for --time and --noise against a single one", passes, total,
-         max(stills.LOOK_SAMPLES // shrink, math.prod(size))),
+        (
+            "passes for --time and --noise against a single one",
+            passes,
+            total,
+            max(stills.LOOK_SAMPLES // shrink, math.prod(size)),
+        ),
         ("all layers against none", layers),
     ):
         median, low, high = function(arguments.repeats, size, *of)
         print(f"{name}: {median:+.1%} (from {low:+.1%} to {high:+.1%})")
     for what, names in (("no layers", ""), ("all layers", ALL_LAYERS)):
         seconds, size = checkpoints(*film, names)
-        print(f"a checkpoint a minute, {film[0]} x {film[1]} pixels, {what}: "
-              f"{seconds / stills.CHECKPOINT_SECONDS:.1%} ({seconds:.2f} s, {size:.0f} MiB)")
+        print(
+            f"a checkpoint a minute, {film[0]} x {film[1]} pixels, {what}: "
+            f"{seconds / stills.CHECKPOINT_SECONDS:.1%} ({seconds:.2f} s, {size:.0f} MiB)"
+        )
 
 
 if __name__ == "__main__":

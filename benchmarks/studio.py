@@ -44,6 +44,7 @@ def write_obj(path):
 
 def write_ply(path, vertices=ICOSAHEDRON, triangles=None):
     """A mesh with a colour at each vertex (attribute vertex_color) and each face (face_color)."""
+
     def colour(i):
         return [0.5 + 0.4 * math.sin(7 * i + j) for j in range(3)]
 
@@ -52,10 +53,11 @@ def write_ply(path, vertices=ICOSAHEDRON, triangles=None):
     header += [f"property float {name}" for name in "xyzrgb"]
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     header += [f"property float {name}" for name in "rgb"]
-    lines = [" ".join(f"{c:.9g}" for c in (*v, *colour(i)))
-             for i, v in enumerate(vertices)]
-    lines += [f"3 {a} {b} {c} {(i + 1) / (len(triangles) + 1):f} 0.3 0.5"
-              for i, (a, b, c) in enumerate(triangles)]
+    lines = [" ".join(f"{c:.9g}" for c in (*v, *colour(i))) for i, v in enumerate(vertices)]
+    lines += [
+        f"3 {a} {b} {c} {(i + 1) / (len(triangles) + 1):f} 0.3 0.5"
+        for i, (a, b, c) in enumerate(triangles)
+    ]
     path.write_text("\n".join([*header, "end_header", *lines]) + "\n")
     return str(path)
 
@@ -67,8 +69,7 @@ def write_serialized(path):
     body += struct.pack("<QQ", len(ICOSAHEDRON), len(triangles))
     body += b"".join(struct.pack("<3f", *v) for v in ICOSAHEDRON)
     body += b"".join(struct.pack("<3I", *f) for f in triangles)
-    path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body)
-                     + struct.pack("<QI", 0, 1))
+    path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1))
     return str(path)
 
 
@@ -99,8 +100,13 @@ def place(x, y, z=0.0, size=0.38):
 
 def film(width, height, **more):
     # The box filter keeps pixels independent of each other.
-    return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-            "component_format": "float32"} | more
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "component_format": "float32",
+    } | more
 
 
 def without_emitter_sampling(integrator):
@@ -119,8 +125,13 @@ ROUNDING = 1e-5
 
 
 def nil(twist, quotient, max_depth, **more):
-    integrator = {"type": "nil", "twist": float(twist), "quotient": quotient,
-                  "max_depth": max_depth, "rr_depth": 100_000} | more
+    integrator = {
+        "type": "nil",
+        "twist": float(twist),
+        "quotient": quotient,
+        "max_depth": max_depth,
+        "rr_depth": 100_000,
+    } | more
     return without_emitter_sampling(mi.load_dict(integrator))
 
 
@@ -133,9 +144,12 @@ def glowing(shape):
 
 
 def sensor(origin, target, size=32, **more):
-    return {"type": "perspective", "fov": 80,
-            "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1]),
-            "film": film(size, size, **more)}
+    return {
+        "type": "perspective",
+        "fov": 80,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1]),
+        "film": film(size, size, **more),
+    }
 
 
 def cube_room():

@@ -33,10 +33,12 @@ def package(scene, space, max_distance, shapes=None):
 
 def chords(method, knob):
     """What makes a tracer by a method of ``tracing_methods``, which needs a variant."""
+
     def make(scene, space, max_distance, shapes=None):
         from .tracing_methods import METHODS, ChordTracer
 
         return ChordTracer(scene, space, max_distance, METHODS[method], knob, shapes)
+
     return make
 
 
@@ -49,8 +51,18 @@ OTHERS = [name for name in TRACERS if name != "package"]
 class Traced:
     """First hits by a tracer, with labels and places in the truth's types."""
 
-    def __init__(self, shapes, p, v, twist, quotient, max_distance=12.0, origin=(0, 0, 0),
-                 size=1.0, make=package):
+    def __init__(
+        self,
+        shapes,
+        p,
+        v,
+        twist,
+        quotient,
+        max_distance=12.0,
+        origin=(0, 0, 0),
+        size=1.0,
+        make=package,
+    ):
         from nil_mitsuba.interaction import surface_interaction
         from nil_mitsuba.quotient import Space
         from nil_mitsuba.tracer import Cone
@@ -59,8 +71,9 @@ class Traced:
         space = Space(float(twist), quotient, list(origin), float(size))
         tracer = make(scene, space, max_distance)
         start, direction = mi.Point3f(p), mi.Vector3f(v)
-        hit = tracer.intersect(start, direction, Cone(0, SPREAD), tracer.reach(start, direction),
-                               mi.Bool(True))
+        hit = tracer.intersect(
+            start, direction, Cone(0, SPREAD), tracer.reach(start, direction), mi.Bool(True)
+        )
         si = surface_interaction(hit, direction, space, mi.Color0f())
         label = mi.Int32(truth.NO_SURFACE)
         for shape in scene.shapes():

@@ -60,8 +60,9 @@ def geodesic_acceleration(p, velocity, twist):
     """
     turn = twist * dr.fma(-twist * p.x, velocity.y, velocity.z)
     y = turn * velocity.x
-    return type(velocity)(-turn * velocity.y, y,
-                          dr.fma(twist * p.x, y, twist * velocity.x * velocity.y))
+    return type(velocity)(
+        -turn * velocity.y, y, dr.fma(twist * p.x, y, twist * velocity.x * velocity.y)
+    )
 
 
 class RungeKutta4(Euler):
@@ -151,9 +152,11 @@ class DormandPrince(RungeKutta4):
             sagitta = 0.125 * dr.square(h) * dr.norm(accelerations[0])
             good &= (sagitta <= 2 * tolerance) | (h <= 1e-4)
         wanted = dr.clip(wanted, 1e-4, 1)
-        stepped = {"p": dr.select(good, p_stage, p),
-                   "v": dr.select(good, geometry.to_frame(p_stage, v_stage, k), v),
-                   "h": dr.select(good & (h < state["h"]), state["h"], wanted)}
+        stepped = {
+            "p": dr.select(good, p_stage, p),
+            "v": dr.select(good, geometry.to_frame(p_stage, v_stage, k), v),
+            "h": dr.select(good & (h < state["h"]), state["h"], wanted),
+        }
         return stepped, h, good
 
 
@@ -164,7 +167,9 @@ def fixed_steps(p, v, length, steps, twist):
     steps = dr.opaque(dr.llvm.UInt32, steps)
     _, state = dr.while_loop(
         (dr.zeros(dr.llvm.UInt32, dr.width(p)), method.start(p, v)),
-        lambda i, state: i < steps, lambda i, state: (i + 1, method.step(state, dr.inf)[0]))
+        lambda i, state: i < steps,
+        lambda i, state: (i + 1, method.step(state, dr.inf)[0]),
+    )
     return state["p"]
 
 
@@ -178,8 +183,9 @@ def adaptive_steps(p, v, length, tolerance, twist):
         state, h, good = method.step(state, length - t)
         return dr.select(good, dr.select(h < length - t, t + h, length), t), state
 
-    _, state = dr.while_loop((dr.zeros(float_t, dr.width(p)), method.start(p, v)),
-                             lambda t, state: t < length, step)
+    _, state = dr.while_loop(
+        (dr.zeros(float_t, dr.width(p)), method.start(p, v)), lambda t, state: t < length, step
+    )
     return state["p"]
 
 
@@ -187,8 +193,11 @@ class ClosedForm(Euler):
     """Chords of fixed length; ``geometry.flow`` from where the ray started or entered the cell."""
 
     def start(self, p, v):
-        return super().start(p, v) | {"base": type(p)(p), "v_base": type(v)(v),
-                                      "t": dr.zeros(type(p.x), dr.width(p, v))}
+        return super().start(p, v) | {
+            "base": type(p)(p),
+            "v_base": type(v)(v),
+            "t": dr.zeros(type(p.x), dr.width(p, v)),
+        }
 
     def formula(self, p, v, t):
         return geometry.flow(p, v, t, self.twist)
@@ -200,9 +209,11 @@ class ClosedForm(Euler):
         return state | {"p": p, "v": v, "t": t}, h, dr.mask_t(h)(True)
 
     def behind_face(self, state, crossed):
-        return state | {"base": dr.select(crossed, state["p"], state["base"]),
-                        "v_base": dr.select(crossed, state["v"], state["v_base"]),
-                        "t": dr.select(crossed, 0, state["t"])}
+        return state | {
+            "base": dr.select(crossed, state["p"], state["base"]),
+            "v_base": dr.select(crossed, state["v"], state["v_base"]),
+            "t": dr.select(crossed, 0, state["t"]),
+        }
 
     def between(self, v0, v1, s, t):
         return geometry.turned(v0, self.twist * v0.z * t * s)
@@ -239,8 +250,16 @@ class ChordTracer(Tracer):
         return self._follow(p, v, start, reach, active, time, True).valid
 
     @dr.syntax
-    def _follow(self, p: mi.Point3f, v: mi.Vector3f, start: mi.Point3f, reach: mi.Float,
-                active: mi.Bool, time: mi.Float, any_hit: bool) -> Hit:
+    def _follow(
+        self,
+        p: mi.Point3f,
+        v: mi.Vector3f,
+        start: mi.Point3f,
+        reach: mi.Float,
+        active: mi.Bool,
+        time: mi.Float,
+        any_hit: bool,
+    ) -> Hit:
         scene, space, method = self.scene, self.space, self.method
         state = method.start(mi.Point3f(p), mi.Vector3f(v))
         # The chord in work runs from ``vertex`` (at arc length t0) to the state's point (at t1);
@@ -269,8 +288,12 @@ class ChordTracer(Tracer):
             piece = self.piece(vertex, state["p"], v0, t0)
             # No piece reaches past the end.
             after = dr.select(piece.leaves | (t1 < reach), space.slack, 0)
-            ray = line_ray(piece.o, piece.d, time, space.size * (
-                piece.part * piece.length + piece.before + after))
+            ray = line_ray(
+                piece.o,
+                piece.d,
+                time,
+                space.size * (piece.part * piece.length + piece.before + after),
+            )
 
             # --------------------------- What it met ---------------------------
             there = mi.Bool(False)
@@ -293,16 +316,23 @@ class ChordTracer(Tracer):
             leaves = piece.leaves & good & ~there
             s_leave = dr.fma(piece.part, t1 - t0, t0)
             t0 = dr.select(good, dr.select(leaves, s_leave, t1), t0)
-            vertex = dr.select(good, dr.select(
-                leaves, dr.fma(piece.along, piece.part, vertex), state["p"]), vertex)
+            vertex = dr.select(
+                good, dr.select(leaves, dr.fma(piece.along, piece.part, vertex), state["p"]), vertex
+            )
             if space.quotient:
                 face = dr.select(leaves, piece.face, 0)
                 vertex, (moved,), cell = through_face(vertex, [state["p"]], cell, face, space)
                 state = method.behind_face(state | {"p": moved}, leaves)
             active &= ~there & (t0 < reach)
 
-        return Hit(valid=valid, distance=distance, arrival=arrival, cell=cell, ray=ray_found,
-                   preliminary=found)
+        return Hit(
+            valid=valid,
+            distance=distance,
+            arrival=arrival,
+            cell=cell,
+            ray=ray_found,
+            preliminary=found,
+        )
 
 
 METHODS = {

@@ -17,18 +17,19 @@ from dataclasses import dataclass
 import drjit as dr
 from drjit.llvm import Array3f64, Array3i, Bool, Float64, Int32, UInt32, UInt64
 
-STEP = 0.02          # arc length of one step of the scan, in cells; see first_hit()
-ROOT_WIDTH = 1e-12   # arc length to which roots and cell crossings are bracketed
-OVERLAP = 1e-8       # intervals of the scan overlap by this, so that no root falls between two
+STEP = 0.02  # arc length of one step of the scan, in cells; see first_hit()
+ROOT_WIDTH = 1e-12  # arc length to which roots and cell crossings are bracketed
+OVERLAP = 1e-8  # intervals of the scan overlap by this, so that no root falls between two
 # A ray has left its cell when it is this far outside: above rounding, so that a ray along a face
 # does not change cells for ever
 FACE = 2e-13
-NO_SURFACE = -1      # label of a ray that hits nothing
+NO_SURFACE = -1  # label of a ray that hits nothing
 
 
 # ---------------------------------------------------------------------------------------------
 #  The group and its geodesics
 # ---------------------------------------------------------------------------------------------
+
 
 def multiply(p, q, twist):
     """Group product p·q."""
@@ -84,6 +85,7 @@ def _segment(u, sin_u):
 #  Surfaces
 # ---------------------------------------------------------------------------------------------
 
+
 def _sub(a, b):
     return tuple(x - y for x, y in zip(a, b))
 
@@ -99,13 +101,14 @@ def _cross(a, b):
 @dataclass(frozen=True)
 class Sphere:
     """The points at coordinate distance `radius` from `center`."""
+
     center: tuple
     radius: float
 
     def implicit(self, p, velocity):
         """Implicit function at p and its rate of change along a coordinate velocity."""
         d = p - Array3f64(*self.center)
-        return dr.squared_norm(d) - self.radius ** 2, 2 * dr.dot(d, velocity)
+        return dr.squared_norm(d) - self.radius**2, 2 * dr.dot(d, velocity)
 
     def contains(self, p):
         """Whether a zero p of the implicit function belongs to the surface."""
@@ -119,6 +122,7 @@ class Sphere:
 @dataclass(frozen=True)
 class Rectangle:
     """The parallelogram `corner` + α `u` + β `v` with α and β in [0, 1]."""
+
     corner: tuple
     u: tuple
     v: tuple
@@ -144,8 +148,12 @@ class Rectangle:
 
     def to_mitsuba(self, mi):
         """Mitsuba's description of the shape: its rectangle is [-1, 1]² before `to_world`."""
-        columns = [[0.5 * x for x in self.u], [0.5 * x for x in self.v], self._normal,
-                   [c + 0.5 * (x + y) for c, x, y in zip(self.corner, self.u, self.v)]]
+        columns = [
+            [0.5 * x for x in self.u],
+            [0.5 * x for x in self.v],
+            self._normal,
+            [c + 0.5 * (x + y) for c, x, y in zip(self.corner, self.u, self.v)],
+        ]
         rows = [[float(column[i]) for column in columns] for i in range(3)] + [[0, 0, 0, 1]]
         return {"type": "rectangle", "to_world": mi.ScalarTransform4f(rows)}
 
@@ -153,6 +161,7 @@ class Rectangle:
 @dataclass(frozen=True)
 class Cylinder:
     """The points at coordinate distance `radius` from the segment `p0` `p1`, without caps."""
+
     p0: tuple
     p1: tuple
     radius: float
@@ -166,7 +175,7 @@ class Cylinder:
     def implicit(self, p, velocity):
         """Implicit function at p and its rate of change along a coordinate velocity."""
         across = self._split(p - Array3f64(*self.p0))[1]
-        return dr.squared_norm(across) - self.radius ** 2, 2 * dr.dot(across, velocity)
+        return dr.squared_norm(across) - self.radius**2, 2 * dr.dot(across, velocity)
 
     def contains(self, p):
         """Whether a zero p of the implicit function belongs to the surface."""
@@ -175,8 +184,7 @@ class Cylinder:
 
     def to_mitsuba(self, mi):
         """Mitsuba's description of the shape."""
-        return {"type": "cylinder", "p0": list(self.p0), "p1": list(self.p1),
-                "radius": self.radius}
+        return {"type": "cylinder", "p0": list(self.p0), "p1": list(self.p1), "radius": self.radius}
 
 
 def to_mitsuba(surfaces, mi):
@@ -188,15 +196,17 @@ def to_mitsuba(surfaces, mi):
 #  First hits
 # ---------------------------------------------------------------------------------------------
 
+
 @dataclass
 class Hit:
     """First hits: arrays of one entry per ray."""
-    t: Float64            # arc length in cells, infinite where nothing is hit
-    label: Int32          # index of the surface, NO_SURFACE where nothing is hit
-    g: Array3i            # deck element: the image g·S of the surface S was hit (0 in plain Nil)
-    p: Array3f64          # position in the universal cover (at the last step where nothing is hit)
-    p_cell: Array3f64     # position g⁻¹·p in the home cell, where it lies on S itself
-    v: Array3f64          # frame direction, the same in the cover and in the cell
+
+    t: Float64  # arc length in cells, infinite where nothing is hit
+    label: Int32  # index of the surface, NO_SURFACE where nothing is hit
+    g: Array3i  # deck element: the image g·S of the surface S was hit (0 in plain Nil)
+    p: Array3f64  # position in the universal cover (at the last step where nothing is hit)
+    p_cell: Array3f64  # position g⁻¹·p in the home cell, where it lies on S itself
+    v: Array3f64  # frame direction, the same in the cover and in the cell
 
 
 def first_hit(surfaces, p, v, t_max, twist, quotient, step=STEP):
@@ -250,23 +260,35 @@ def first_hit(surfaces, p, v, t_max, twist, quotient, step=STEP):
         for i, surface in enumerate(surfaces):
             f0, df0 = surface.implicit(q0, velocity0)
             f1, df1 = surface.implicit(q1, velocity1)
-            candidates |= dr.select((f0 * f1 <= 0) | _may_touch(f0, df0, f1, df1, step),
-                                    UInt32(1 << i), UInt32(0))
+            candidates |= dr.select(
+                (f0 * f1 <= 0) | _may_touch(f0, df0, f1, df1, step), UInt32(1 << i), UInt32(0)
+            )
 
-        t_root, index = _first_root(surfaces, candidates, lambda s: local(g, s),
-                                    t - OVERLAP, t1 + OVERLAP)
+        t_root, index = _first_root(
+            surfaces, candidates, lambda s: local(g, s), t - OVERLAP, t1 + OVERLAP
+        )
         hit = t_root < t_hit
-        return (t1, dr.select(hit, t_root, t_hit), dr.select(hit, index, label),
-                dr.select(hit, g, g_hit))
+        return (
+            t1,
+            dr.select(hit, t_root, t_hit),
+            dr.select(hit, index, label),
+            dr.select(hit, g, g_hit),
+        )
 
     size = dr.width(p, v, t_max)
     t, t_hit, label, g = dr.while_loop(
-        (dr.zeros(Float64, size), dr.full(Float64, math.inf, size),
-         dr.full(Int32, NO_SURFACE, size), dr.zeros(Array3f64, size)),
-        lambda t, t_hit, label, g: (t < t_max) & (t_hit == math.inf), scan,
-        label="scan")
+        (
+            dr.zeros(Float64, size),
+            dr.full(Float64, math.inf, size),
+            dr.full(Int32, NO_SURFACE, size),
+            dr.zeros(Array3f64, size),
+        ),
+        lambda t, t_hit, label, g: (t < t_max) & (t_hit == math.inf),
+        scan,
+        label="scan",
+    )
 
-    missed = t_hit > t_max      # the overlap reaches beyond the last step
+    missed = t_hit > t_max  # the overlap reaches beyond the last step
     t_hit = dr.select(missed, math.inf, dr.maximum(t_hit, 0))
     label = dr.select(missed, NO_SURFACE, label)
     q, direction = flow(p, v, dr.select(missed, t, t_hit), twist)
@@ -290,8 +312,11 @@ def _turning_point(q, v, twist, step):
     Extrapolated from the first two derivatives; the next step starts near it and corrects it, so
     what can leave the cell and come back unseen goes less than about 1e-10 beyond the face.
     """
-    acceleration = Array3f64(-twist * v.z * v.y, twist * v.z * v.x,
-                             twist * v.x * v.y + dr.square(twist) * q.x * v.z * v.x)
+    acceleration = Array3f64(
+        -twist * v.z * v.y,
+        twist * v.z * v.x,
+        twist * v.x * v.y + dr.square(twist) * q.x * v.z * v.x,
+    )
     first = Float64(step)
     for d, dd in zip(coordinate_velocity(q, v, twist), acceleration):
         turn = -d / dr.select(dd == 0, 1, dd)
@@ -302,6 +327,7 @@ def _turning_point(q, v, twist, step):
 
 def _leave_cell(local, g, t0, q0, t1):
     """Where a ray inside cell g at t0 is first outside of it, t1 if that is not before t1."""
+
     def excess(q):
         return dr.max(dr.maximum(-q, q - 1))
 
@@ -309,8 +335,15 @@ def _leave_cell(local, g, t0, q0, t1):
         return dr.any((q < -FACE) | (q > 1 + FACE))
 
     q1 = local(g, t1)[0]
-    return _bracket(lambda t: excess(local(g, t)[0]), lambda t, f: outside(local(g, t)[0]),
-                    t0, t1, excess(q0), excess(q1), outside(q1))[1]
+    return _bracket(
+        lambda t: excess(local(g, t)[0]),
+        lambda t, f: outside(local(g, t)[0]),
+        t0,
+        t1,
+        excess(q0),
+        excess(q1),
+        outside(q1),
+    )[1]
 
 
 def _may_touch(f0, df0, f1, df1, step):
@@ -327,6 +360,7 @@ def _may_touch(f0, df0, f1, df1, step):
 
 def _first_root(surfaces, candidates, local, t0, t1):
     """Arc length and index of the first hit in [t0, t1] among the surfaces whose bit is set."""
+
     def implicit(index, t):
         q, velocity = local(t)
         value, slope, inside = Float64(0), Float64(0), Bool(False)
@@ -345,16 +379,32 @@ def _first_root(surfaces, candidates, local, t0, t1):
 
         # Split at the extremum where there is no sign change to rely on
         split = f0 * f1 > 0
-        a, b = _bracket(lambda t: implicit(index, t)[1], lambda t, df: df * df1 > 0,
-                        t0, t1, df0, df1, split & (df0 * df1 < 0))
+        a, b = _bracket(
+            lambda t: implicit(index, t)[1],
+            lambda t, df: df * df1 > 0,
+            t0,
+            t1,
+            df0,
+            df1,
+            split & (df0 * df1 < 0),
+        )
         t_middle = dr.select(split, 0.5 * (a + b), t1)
         f_middle = implicit(index, t_middle)[0]
 
-        for a, b, fa, fb, possible in ((t0, t_middle, f0, f_middle, Bool(True)),
-                                       (t_middle, t1, f_middle, f1, split)):
+        for a, b, fa, fb, possible in (
+            (t0, t_middle, f0, f_middle, Bool(True)),
+            (t_middle, t1, f_middle, f1, split),
+        ):
             possible &= fa * fb <= 0
-            lower, upper = _bracket(lambda t: implicit(index, t)[0], lambda t, f: f * fa <= 0,
-                                    a, b, fa, fb, possible & (fa * fb < 0))
+            lower, upper = _bracket(
+                lambda t: implicit(index, t)[0],
+                lambda t, f: f * fa <= 0,
+                a,
+                b,
+                fa,
+                fb,
+                possible & (fa * fb < 0),
+            )
             root = dr.select(fa == 0, a, dr.select(fb == 0, b, 0.5 * (lower + upper)))
             closer = possible & (root < best) & implicit(index, root)[2]
             best, best_index = dr.select(closer, root, best), dr.select(closer, index, best_index)
@@ -362,7 +412,10 @@ def _first_root(surfaces, candidates, local, t0, t1):
 
     _, best, index = dr.while_loop(
         (candidates, dr.full(Float64, math.inf), Int32(NO_SURFACE)),
-        lambda candidates, best, index: candidates != 0, refine, label="refine")
+        lambda candidates, best, index: candidates != 0,
+        refine,
+        label="refine",
+    )
     return best, index
 
 
@@ -375,24 +428,34 @@ def _bracket(f, beyond, a, b, fa, fb, active):
     far end comes close too; bisection after 12 steps, for f that false position cannot follow.
     Where not `active`, [a, b] is returned as it is.
     """
+
     def narrow(a, b, fa, fb, n):
         m = dr.select(fa * fb < 0, b - fb * (b - a) / (fb - fa), 0.5 * (a + b))
         m = dr.select(n < 12, m, 0.5 * (a + b))
         m = dr.clip(m, a + 0.5 * ROOT_WIDTH, b - 0.5 * ROOT_WIDTH)
         fm = f(m)
         right = beyond(m, fm)
-        return (dr.select(right, a, m), dr.select(right, m, b),
-                dr.select(right, 0.5 * fa, fm), dr.select(right, fm, 0.5 * fb), n + 1)
+        return (
+            dr.select(right, a, m),
+            dr.select(right, m, b),
+            dr.select(right, 0.5 * fa, fm),
+            dr.select(right, fm, 0.5 * fb),
+            n + 1,
+        )
 
     lower, upper, _, _, _ = dr.while_loop(
         (a, b, fa, fb, UInt32(0)),
-        lambda a, b, fa, fb, n: active & (b - a > ROOT_WIDTH), narrow, label="bracket")
+        lambda a, b, fa, fb, n: active & (b - a > ROOT_WIDTH),
+        narrow,
+        label="bracket",
+    )
     return lower, upper
 
 
 # ---------------------------------------------------------------------------------------------
 #  Measures of a renderer's answer
 # ---------------------------------------------------------------------------------------------
+
 
 def across_error(p, v, t, q, twist):
     """
@@ -436,7 +499,7 @@ def near_silhouette(hashes, width, height):
     differs = dr.zeros(Bool, width * height)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
-            neighbour = (dr.clip(y + dy, 0, height - 1) * width + dr.clip(x + dx, 0, width - 1))
+            neighbour = dr.clip(y + dy, 0, height - 1) * width + dr.clip(x + dx, 0, width - 1)
             differs |= dr.gather(UInt64, hashes, UInt32(neighbour)) != hashes
     return differs
 
@@ -444,6 +507,7 @@ def near_silhouette(hashes, width, height):
 # ---------------------------------------------------------------------------------------------
 #  Test scenes
 # ---------------------------------------------------------------------------------------------
+
 
 def cell_scene():
     """
@@ -453,29 +517,29 @@ def cell_scene():
     meeting edges exactly, where there is no truth to speak of.
     """
     return [
-        Rectangle((0.20, 0.20, 0.04), (0.60, 0, 0), (0, 0.60, 0)),               # floor
+        Rectangle((0.20, 0.20, 0.04), (0.60, 0, 0), (0, 0.60, 0)),  # floor
         Sphere((0.55, 0.50, 0.60), 0.12),
         Sphere((0.22, 0.25, 0.22), 0.10),
         Sphere((0.82, 0.28, 0.78), 0.07),
         Sphere((0.30, 0.80, 0.88), 0.05),
         Sphere((0.78, 0.80, 0.12), 0.03),
-        Rectangle((0.10, 0.55, 0.25), (0.12, 0.16, 0), (-0.08, 0.06, 0.15)),     # slanted
+        Rectangle((0.10, 0.55, 0.25), (0.12, 0.16, 0), (-0.08, 0.06, 0.15)),  # slanted
         Cylinder((0.85, 0.88, 0.20), (0.90, 0.84, 0.80), 0.02),
         Cylinder((0.15, 0.12, 0.70), (0.60, 0.15, 0.92), 0.01),
-        Rectangle((0.93, 0.3017, 0.2039), (0, 0.2111, 0), (0, 0, 0.2523)),       # facing x
+        Rectangle((0.93, 0.3017, 0.2039), (0, 0.2111, 0), (0, 0, 0.2523)),  # facing x
     ]
 
 
 def room_scene():
     """A scene for plain Nil: an open room of two units around the origin and what stands in it."""
     return [
-        Rectangle((-1, -1, -1), (2, 0, 0), (0, 2, 0)),                           # floor
-        Rectangle((-1, 1, -1), (2, 0, 0), (0, 0, 2)),                            # back wall
-        Rectangle((-1, -1, -1), (0, 2, 0), (0, 0, 2)),                           # left wall
+        Rectangle((-1, -1, -1), (2, 0, 0), (0, 2, 0)),  # floor
+        Rectangle((-1, 1, -1), (2, 0, 0), (0, 0, 2)),  # back wall
+        Rectangle((-1, -1, -1), (0, 2, 0), (0, 0, 2)),  # left wall
         Sphere((0.30, 0.20, -0.50), 0.40),
         Sphere((-0.55, 0.45, -0.75), 0.20),
         Sphere((0.60, -0.50, 0.30), 0.12),
-        Rectangle((-0.70, 0.10, 0.10), (0.36, 0.48, 0), (-0.16, 0.12, 0.40)),    # slanted
+        Rectangle((-0.70, 0.10, 0.10), (0.36, 0.48, 0), (-0.16, 0.12, 0.40)),  # slanted
         Cylinder((0.70, 0.70, -0.95), (0.60, 0.75, 0.90), 0.05),
         Cylinder((-0.80, -0.60, 0.60), (0.50, -0.20, 0.85), 0.02),
     ]

@@ -34,14 +34,25 @@ def glued_faces(path, size):
                 y = i / 200
                 z = (line + 0.5) / 6 + twist * y
                 # A line that leaves through the top comes in from below: a new piece
-                rows.append({"y": y, "z": z - math.floor(z), "height": (line + 0.5) / 6,
-                             "piece": f"{line}/{math.floor(z)}"})
-        panels.append(alt.Chart(alt.Data(values=rows)).mark_line(strokeWidth=5).encode(
-            x=alt.X("y:Q", scale=alt.Scale(domain=[0, 1])),
-            y=alt.Y("z:Q", scale=alt.Scale(domain=[0, 1])),
-            detail="piece:N",
-            color=alt.Color("height:Q", legend=None, scale=alt.Scale(scheme="plasma")),
-        ).properties(width=size, height=size, title=title))
+                rows.append(
+                    {
+                        "y": y,
+                        "z": z - math.floor(z),
+                        "height": (line + 0.5) / 6,
+                        "piece": f"{line}/{math.floor(z)}",
+                    }
+                )
+        panels.append(
+            alt.Chart(alt.Data(values=rows))
+            .mark_line(strokeWidth=5)
+            .encode(
+                x=alt.X("y:Q", scale=alt.Scale(domain=[0, 1])),
+                y=alt.Y("z:Q", scale=alt.Scale(domain=[0, 1])),
+                detail="piece:N",
+                color=alt.Color("height:Q", legend=None, scale=alt.Scale(scheme="plasma")),
+            )
+            .properties(width=size, height=size, title=title)
+        )
     alt.hconcat(*panels).save(str(path), scale_factor=2)
 
 
@@ -50,18 +61,23 @@ def level_looks(path, size):
     rows = []
     for azimuth in range(0, 181, 15):
         a, b = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
-        p, _ = geometry.flow(mi.Point3f(0), mi.Vector3f(a, b, 0),
-                             dr.linspace(mi.Float, 0, 3, 61), 1)
+        p, _ = geometry.flow(
+            mi.Point3f(0), mi.Vector3f(a, b, 0), dr.linspace(mi.Float, 0, 3, 61), 1
+        )
         rows += [{"length": 3 * i / 60, "z": z, "azimuth": azimuth} for i, z in enumerate(p.z)]
     alt.Chart(alt.Data(values=rows)).mark_line().encode(
         x=alt.X("length:Q", title="length (cells)"),
         y=alt.Y("z:Q", title="height z (cells)"),
         detail="azimuth:N",
-        color=alt.Color("azimuth:Q", title="azimuth from x (degrees)",
-                        scale=alt.Scale(scheme="blueorange", domain=[0, 180]),
-                        legend=alt.Legend(values=[0, 45, 90, 135, 180])),
-    ).properties(width=1.4 * size, height=size,
-                 title="Level looks from the origin").save(str(path), scale_factor=2)
+        color=alt.Color(
+            "azimuth:Q",
+            title="azimuth from x (degrees)",
+            scale=alt.Scale(scheme="blueorange", domain=[0, 180]),
+            legend=alt.Legend(values=[0, 45, 90, 135, 180]),
+        ),
+    ).properties(width=1.4 * size, height=size, title="Level looks from the origin").save(
+        str(path), scale_factor=2
+    )
 
 
 def leaning_fibres(path, size, spp):
@@ -70,16 +86,22 @@ def leaning_fibres(path, size, spp):
     scene = {
         "type": "scene",
         "integrator": {"type": "nil", "quotient": False, "max_depth": 3},
-        "sensor": {"type": "perspective", "fov": 60,
-                   "to_world": T.look_at([0, 0, 0], [0, 1, 0], [0, 0, 1]),
-                   "film": {"type": "hdrfilm", "width": size, "height": size * 9 // 16}},
+        "sensor": {
+            "type": "perspective",
+            "fov": 60,
+            "to_world": T.look_at([0, 0, 0], [0, 1, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": size, "height": size * 9 // 16},
+        },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.95, 0.96, 1.0]}},
     }
     for i, y in enumerate((0.5, 1, 2, 4, 8)):
         color = [0.75 - 0.16 * i, 0.12 + 0.06 * i, 0.10 + 0.14 * i]
         scene[f"rod {i}"] = {
             # As thick as its distance makes it look thin
-            "type": "cylinder", "p0": [0, y, -20], "p1": [0, y, 20], "radius": 0.02 * y,
+            "type": "cylinder",
+            "p0": [0, y, -20],
+            "p1": [0, y, 20],
+            "radius": 0.02 * y,
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": color}},
         }
     picture = mi.render(mi.load_dict(scene), spp=spp)
@@ -89,8 +111,9 @@ def leaning_fibres(path, size, spp):
 def example(program, output, *arguments):
     """Run a program of examples/; a JPEG is made from its PNG, for Mitsuba's default is large."""
     png = output.with_suffix(".png")
-    subprocess.run([sys.executable, str(EXAMPLES / program), "-o", str(png), *arguments],
-                   check=True)
+    subprocess.run(
+        [sys.executable, str(EXAMPLES / program), "-o", str(png), *arguments], check=True
+    )
     if output != png:
         mi.Bitmap(str(png)).write(str(output), quality=90)
         png.unlink()
@@ -111,8 +134,14 @@ def main():
     # An even sky makes little noise.
     leaning_fibres(options.to / "leaning-fibres.jpg", size, max(1, spp // 4))
     example("light_images.py", options.to / "light-images.png", "--size", str(size // 3))
-    example("twist.py", options.to / "twist.jpg", "--size", str(size // 3), "--spp",
-            str(max(1, spp // 2)))
+    example(
+        "twist.py",
+        options.to / "twist.jpg",
+        "--size",
+        str(size // 3),
+        "--spp",
+        str(max(1, spp // 2)),
+    )
     print(f"{options.to}: five pictures for looking-at-nil.md")
 
 

@@ -53,12 +53,26 @@ def render(name, folder, options):
     """Render one still by the command line into a folder; the path of its PNG."""
     outputs = ["-o", f"{name}.exr", "--png", f"{name}.png"]
     start = processor_time()
-    subprocess.run([sys.executable, "-c", "from nil_mitsuba.cli import main; main()", "render",
-                    str(ROOT / "scenes" / f"{name}.xml"), *options, *outputs],
-                   cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from nil_mitsuba.cli import main; main()",
+            "render",
+            str(ROOT / "scenes" / f"{name}.xml"),
+            *options,
+            *outputs,
+        ],
+        cwd=folder,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     seconds = processor_time() - start
-    print(f"{seconds:6.0f} s  nil-mitsuba render scenes/{name}.xml",
-          shlex.join([*options, *outputs]), flush=True)
+    print(
+        f"{seconds:6.0f} s  nil-mitsuba render scenes/{name}.xml",
+        shlex.join([*options, *outputs]),
+        flush=True,
+    )
     return folder / f"{name}.png"
 
 
@@ -78,8 +92,13 @@ def write_jpeg(bitmap, path):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("names", nargs="*", default=list(STILLS), metavar="SCENE",
-                        help="default: all stills of the gallery")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        default=list(STILLS),
+        metavar="SCENE",
+        help="default: all stills of the gallery",
+    )
     parser.add_argument("--to", type=Path, default=ROOT / "gallery", metavar="FOLDER")
     parser.add_argument("--size", type=int, help="width in pixels; default: the scene's")
     parser.add_argument("--spp", type=int, help="samples per pixel, for all")

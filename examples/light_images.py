@@ -61,8 +61,9 @@ def further(p, q, twist, length):
 def taken(way, length, exists=True):
     index = dr.compress(exists & (way.distance <= length))
     direction = dr.gather(mi.Vector3f, mi.Vector3f(way.direction), index)
-    distance, density = (dr.gather(mi.Float, mi.Float(x), index)
-                         for x in (way.distance, way.area_density))
+    distance, density = (
+        dr.gather(mi.Float, mi.Float(x), index) for x in (way.distance, way.area_density)
+    )
     return list(zip(distance, direction.x, direction.y, direction.z, dr.abs(density)))
 
 
@@ -70,8 +71,9 @@ def expected(lengths, twist, shortest_only, steps=500):
     """∫∫ |A| dω dt up to each of the equidistant ``lengths``."""
     step = lengths[1] - lengths[0]
     # Midpoints in |w| and t; geodesics are the same in all azimuths.
-    w, t = dr.meshgrid((dr.arange(mi.Float, steps) + 0.5) / steps,
-                       (dr.arange(mi.Float, steps) + 0.5) / steps)
+    w, t = dr.meshgrid(
+        (dr.arange(mi.Float, steps) + 0.5) / steps, (dr.arange(mi.Float, steps) + 0.5) / steps
+    )
     totals = [0.0]
     for begin in lengths[:-1]:
         length = begin + step * t
@@ -88,27 +90,51 @@ def draw(path, size, counts, sky, near):
     counts = [row for row in counts if row["count"] >= 1]  # the axis is logarithmic
     base = alt.Chart(alt.Data(values=counts)).encode(
         x=alt.X("length:Q", title="length of the geodesic (cells)"),
-        y=alt.Y("count:Q", scale=alt.Scale(type="log", nice=False), axis=alt.Axis(format="~s"),
-                title="how many"),
-        color=alt.Color("what:N", title=None, sort=None,
-                        scale=alt.Scale(range=["#1f5fa8", "#d1495b"]),
-                        legend=alt.Legend(orient="top-left")),
+        y=alt.Y(
+            "count:Q",
+            scale=alt.Scale(type="log", nice=False),
+            axis=alt.Axis(format="~s"),
+            title="how many",
+        ),
+        color=alt.Color(
+            "what:N",
+            title=None,
+            sort=None,
+            scale=alt.Scale(range=["#1f5fa8", "#d1495b"]),
+            legend=alt.Legend(orient="top-left"),
+        ),
     )
     theory = base.mark_line().transform_filter("datum.by == 'theory'")
     counted = base.mark_point(size=24).transform_filter("datum.by == 'counted'")
     lines = (theory + counted).properties(
-        width=size, height=0.75 * size, title="Counted (circles) and expected (lines)")
+        width=size, height=0.75 * size, title="Counted (circles) and expected (lines)"
+    )
     # Equal areas for equal solid angles: azimuth by sine of the elevation.
-    dots = alt.Chart(alt.Data(values=sky)).mark_circle(opacity=0.8).encode(
-        x=alt.X("azimuth:Q", scale=alt.Scale(domain=[-180, 180], nice=False),
-                axis=alt.Axis(values=list(range(-180, 181, 60))), title="azimuth (degrees)"),
-        y=alt.Y("w:Q", scale=alt.Scale(domain=[-1, 1]), title="fibre component of the direction"),
-        # Areas as the light that arrives
-        size=alt.Size("light:Q", scale=alt.Scale(range=[0.5, 400]), legend=None),
-        color=alt.Color("length:Q", scale=alt.Scale(scheme="viridis", reverse=True),
-                        title="length"),
-    ).properties(width=size, height=0.75 * size,
-                 title=f"The receiver's sky: {len(sky)} images within {near:.1f} cells")
+    dots = (
+        alt.Chart(alt.Data(values=sky))
+        .mark_circle(opacity=0.8)
+        .encode(
+            x=alt.X(
+                "azimuth:Q",
+                scale=alt.Scale(domain=[-180, 180], nice=False),
+                axis=alt.Axis(values=list(range(-180, 181, 60))),
+                title="azimuth (degrees)",
+            ),
+            y=alt.Y(
+                "w:Q", scale=alt.Scale(domain=[-1, 1]), title="fibre component of the direction"
+            ),
+            # Areas as the light that arrives
+            size=alt.Size("light:Q", scale=alt.Scale(range=[0.5, 400]), legend=None),
+            color=alt.Color(
+                "length:Q", scale=alt.Scale(scheme="viridis", reverse=True), title="length"
+            ),
+        )
+        .properties(
+            width=size,
+            height=0.75 * size,
+            title=f"The receiver's sky: {len(sky)} images within {near:.1f} cells",
+        )
+    )
     (lines | dots).resolve_scale(color="independent").save(path, scale_factor=2)
 
 
@@ -126,20 +152,27 @@ def main():
     far = further(p, q, twist, length)
     # Within 2π/k there is one geodesic to each image.
     sky_length = min(length, 2 * math.pi / twist)
-    sky = [{"azimuth": math.degrees(math.atan2(b, a)), "w": w, "length": t, "light": 1 / area}
-           for t, a, b, w, area in near if t <= sky_length]
+    sky = [
+        {"azimuth": math.degrees(math.atan2(b, a)), "w": w, "length": t, "light": 1 / area}
+        for t, a, b, w, area in near
+        if t <= sky_length
+    ]
 
     lengths = [length * i / 48 for i in range(49)]
     images_expected = expected(lengths, twist, shortest_only=True)
     all_expected = expected(lengths, twist, shortest_only=False)
     further_expected = [total - part for total, part in zip(all_expected, images_expected)]
     counts, summary = [], []
-    for what, found, theory in (("images", near, images_expected),
-                                ("further geodesics to them", far, further_expected)):
+    for what, found, theory in (
+        ("images", near, images_expected),
+        ("further geodesics to them", far, further_expected),
+    ):
         counted = [sum(way[0] <= at for way in found) for at in lengths]
         for by, values in (("counted", counted), ("theory", theory)):
-            counts += [{"length": at, "count": count, "what": what, "by": by}
-                       for at, count in zip(lengths, values)]
+            counts += [
+                {"length": at, "count": count, "what": what, "by": by}
+                for at, count in zip(lengths, values)
+            ]
         summary.append(f"{counted[-1]} {what} (theory {theory[-1]:.0f})")
     draw(options.output, options.size, counts, sky, sky_length)
     print(f"{options.output}: within {length:g} cells {' and '.join(summary)}")

@@ -29,9 +29,13 @@ def fitted(path, up):
     to_world = to_world @ T().translate([-middle.x, -middle.y, -box.min.z]) @ turn
     return description | {
         "to_world": to_world,
-        "bsdf": {"type": "twosided", "bsdf": {
-            "type": "plastic",
-            "diffuse_reflectance": {"type": "rgb", "value": [0.80, 0.50, 0.36]}}},
+        "bsdf": {
+            "type": "twosided",
+            "bsdf": {
+                "type": "plastic",
+                "diffuse_reflectance": {"type": "rgb", "value": [0.80, 0.50, 0.36]},
+            },
+        },
     }
 
 
@@ -43,26 +47,40 @@ def stage(mesh, width):
         "type": "scene",
         "integrator": {"type": "nil", "max_distance": 4.0, "max_depth": 6},
         "sensor": {
-            "type": "perspective", "fov": 65,
-            "to_world": T().look_at(origin=[0.25, 0.02, 0.52], target=[0.48, 0.6, 0.38],
-                                    up=[0, 0, 1]),
+            "type": "perspective",
+            "fov": 65,
+            "to_world": T().look_at(
+                origin=[0.25, 0.02, 0.52], target=[0.48, 0.6, 0.38], up=[0, 0, 1]
+            ),
             "film": {"type": "hdrfilm", "width": width, "height": width * 9 // 16},
         },
-        "sky": {"type": "envmap", "filename": str(ROOT / "scenes" / "textures" / "evening.exr"),
-                "scale": 1.4,
-                "to_world": T().rotate([0, 0, 1], 110).rotate([1, 0, 0], 90)},
+        "sky": {
+            "type": "envmap",
+            "filename": str(ROOT / "scenes" / "textures" / "evening.exr"),
+            "scale": 1.4,
+            "to_world": T().rotate([0, 0, 1], 110).rotate([1, 0, 0], 90),
+        },
         "mesh": mesh,
-        "plinth": {"type": "cylinder", "p0": [x, y, 0.1], "p1": [x, y, z - 1e-3], "radius": 0.16,
-                   "bsdf": {"type": "twosided", "bsdf": stone}},
-        "top": {"type": "disk", "bsdf": stone,
-                "to_world": T().translate([x, y, z - 1e-3]).scale(0.16)},
+        "plinth": {
+            "type": "cylinder",
+            "p0": [x, y, 0.1],
+            "p1": [x, y, z - 1e-3],
+            "radius": 0.16,
+            "bsdf": {"type": "twosided", "bsdf": stone},
+        },
+        "top": {
+            "type": "disk",
+            "bsdf": stone,
+            "to_world": T().translate([x, y, z - 1e-3]).scale(0.16),
+        },
     }
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("mesh", nargs="?", type=Path,
-                        default=ROOT / "scenes" / "meshes" / "shell.ply")
+    parser.add_argument(
+        "mesh", nargs="?", type=Path, default=ROOT / "scenes" / "meshes" / "shell.ply"
+    )
     parser.add_argument("--up", choices="yz", default="z", help="the mesh's upward axis")
     parser.add_argument("-o", "--output", default="own_mesh.png")
     parser.add_argument("--size", type=int, default=640, help="width in pixels")

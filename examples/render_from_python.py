@@ -22,22 +22,32 @@ def scene(width, balls=24):
     objects = {
         "type": "scene",
         "sensor": {
-            "type": "perspective", "fov": 75,
+            "type": "perspective",
+            "fov": 75,
             "to_world": T.look_at(origin=[0.1, 0.05, 0.7], target=[0.5, 0.6, 0.45], up=[0, 0, 1]),
             "film": {"type": "hdrfilm", "width": width, "height": width // 2},
         },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.9, 0.95, 1.0]}},
-        "fibre": {"type": "cylinder", "p0": [0.5, 0.6, 0.001], "p1": [0.5, 0.6, 0.999],
-                  "radius": 0.04, "bsdf": {"type": "diffuse"}},
+        "fibre": {
+            "type": "cylinder",
+            "p0": [0.5, 0.6, 0.001],
+            "p1": [0.5, 0.6, 0.999],
+            "radius": 0.04,
+            "bsdf": {"type": "diffuse"},
+        },
     }
     for i in range(balls):
         turn = (i + 0.5) / balls
         angle = 2 * math.pi * turn
         hue = [0.5 + 0.4 * math.cos(angle + third * 2 * math.pi / 3) for third in range(3)]
         objects[f"ball {i}"] = {
-            "type": "sphere", "radius": 0.035,
-            "center": [0.5 + 0.2 * math.cos(angle), 0.6 + 0.2 * math.sin(angle),
-                       0.04 + 0.92 * turn],
+            "type": "sphere",
+            "radius": 0.035,
+            "center": [
+                0.5 + 0.2 * math.cos(angle),
+                0.6 + 0.2 * math.sin(angle),
+                0.04 + 0.92 * turn,
+            ],
             "bsdf": {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": hue}},
         }
     return objects

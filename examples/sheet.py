@@ -18,5 +18,5 @@ def contact_sheet(pictures: list[mi.TensorXf], columns: int) -> mi.TensorXf:
     for i, picture in enumerate(pictures):
         row, column = divmod(i, columns)
         y, x = row * (height + GAP), column * (width + GAP)
-        sheet[y:y + height, x:x + width, :] = picture.array
+        sheet[y : y + height, x : x + width, :] = picture.array
     return sheet

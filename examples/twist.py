@@ -26,8 +26,15 @@ def main():
 
     mi.set_variant("llvm_ad_rgb")
     pictures = [
-        mi.render(mi.load_file(str(options.scene), twist=f"{twist:g}", spp=str(options.spp),
-                               resx=str(options.size), resy=str(options.size)))
+        mi.render(
+            mi.load_file(
+                str(options.scene),
+                twist=f"{twist:g}",
+                spp=str(options.spp),
+                resx=str(options.size),
+                resy=str(options.size),
+            )
+        )
         for twist in options.twists
     ]
     sheet = contact_sheet(pictures, len(pictures))

@@ -42,8 +42,13 @@ def main():
     options = parser.parse_args()
 
     mi.set_variant("llvm_ad_rgb")
-    scene = mi.load_file(str(options.scene), twist=str(options.twist), spp=str(options.spp),
-                         resx=str(options.size), resy=str(options.size * 9 // 16))
+    scene = mi.load_file(
+        str(options.scene),
+        twist=str(options.twist),
+        spp=str(options.spp),
+        resx=str(options.size),
+        resy=str(options.size * 9 // 16),
+    )
     camera = mi.traverse(scene.sensors()[0])
     integrator = scene.integrator()
     origin, cell = mi.Point3f(integrator.cell_origin), integrator.cell_size

@@ -99,8 +99,10 @@ class Box:
         radius is c, and the centre (−2 m, n)/(k w)."""
         rate, c = passage.rate, passage.c
         beside = mi.Bool(False)
-        for centre, low, high in ((-passage.m2, self.lower.x, self.upper.x),
-                                  (passage.n, self.lower.y, self.upper.y)):
+        for centre, low, high in (
+            (-passage.m2, self.lower.x, self.upper.x),
+            (passage.n, self.lower.y, self.upper.y),
+        ):
             low, high = rate * low, rate * high
             low, high = dr.minimum(low, high), dr.maximum(low, high)
             margin = MARGIN * (1 + dr.abs(centre) + dr.abs(low) + dr.abs(high))
@@ -113,9 +115,13 @@ class Occupied:
 
     def __init__(self, boxes: Iterable[mi.ScalarBoundingBox3f], space: Space):
         """``boxes``: those of a scene's shapes (scene units)."""
-        self.boxes = [Box(space.to_cells(opaque(mi.Point3f(box.min))),
-                          space.to_cells(opaque(mi.Point3f(box.max))))
-                      for box in gathered(boxes, space.size_number)]
+        self.boxes = [
+            Box(
+                space.to_cells(opaque(mi.Point3f(box.min))),
+                space.to_cells(opaque(mi.Point3f(box.max))),
+            )
+            for box in gathered(boxes, space.size_number)
+        ]
         self.lower = self.boxes[0].lower
         self.upper = self.boxes[0].upper
         for box in self.boxes[1:]:
@@ -131,8 +137,7 @@ class Occupied:
         return dr.min([box.clearance(p, v, passage) for box in self.boxes], axis=0)
 
 
-def gathered(boxes: Iterable[mi.ScalarBoundingBox3f], size: float
-             ) -> list[mi.ScalarBoundingBox3f]:
+def gathered(boxes: Iterable[mi.ScalarBoundingBox3f], size: float) -> list[mi.ScalarBoundingBox3f]:
     """As few boxes as hold all of these without holding much else; ``size`` is that of a cell.
 
     Rays go by chords of up to a cell inside, so that what counts is a box's volume, a cell wider
@@ -148,8 +153,11 @@ def gathered(boxes: Iterable[mi.ScalarBoundingBox3f], size: float
         return math.prod(extent / size + 1 for extent in box.extents())
 
     while len(found) > 1:
-        pairs = [(volume(_around((a, b))) / (volume(a) + volume(b)), i, j)
-                 for j, b in enumerate(found) for i, a in enumerate(found[:j])]
+        pairs = [
+            (volume(_around((a, b))) / (volume(a) + volume(b)), i, j)
+            for j, b in enumerate(found)
+            for i, a in enumerate(found[:j])
+        ]
         waste, i, j = min(pairs)
         if waste > 2 and len(found) <= MOST_BOXES:
             break

@@ -42,8 +42,11 @@ class Camera:
         parameters = mi.traverse(sensor)
         if name == "BatchSensor":
             # A batch lists its children's parameters behind their names.
-            children = [key[: -len("shutter_open")] for key in parameters.keys()
-                        if key.endswith(".shutter_open")]
+            children = [
+                key[: -len("shutter_open")]
+                for key in parameters.keys()
+                if key.endswith(".shutter_open")
+            ]
             for child in children:
                 turned = f"{child}to_world" in parameters
                 if not turned or f"{child}aperture_radius" in parameters:
@@ -57,8 +60,9 @@ class Camera:
         if self.thinlens:
             self.focus_distance = opaque(mi.Float(parameters["focus_distance"]))
 
-    def start(self, ray: mi.RayDifferential3f, across: mi.Float
-              ) -> tuple[mi.Point3f, mi.Vector3f, Cone, mi.Float]:
+    def start(
+        self, ray: mi.RayDifferential3f, across: mi.Float
+    ) -> tuple[mi.Point3f, mi.Vector3f, Cone, mi.Float]:
         """Start (cells), frame direction, error cone and length (cells) of a sensor ray (scene).
 
         ``across``: the sample's place on the film from its left (0) to its right (1); a batch tells
@@ -73,10 +77,12 @@ class Camera:
         far = ray.maxt / space.size
         if ray.has_differentials:
             # The narrower side of a pixel bounds the error.
-            spread = self.tolerance * dr.minimum(dr.norm(ray.d_x - ray.d),
-                                                 dr.norm(ray.d_y - ray.d))
-            width = self.tolerance / space.size * dr.minimum(dr.norm(ray.o_x - ray.o),
-                                                             dr.norm(ray.o_y - ray.o))
+            spread = self.tolerance * dr.minimum(dr.norm(ray.d_x - ray.d), dr.norm(ray.d_y - ray.d))
+            width = (
+                self.tolerance
+                / space.size
+                * dr.minimum(dr.norm(ray.o_x - ray.o), dr.norm(ray.o_y - ray.o))
+            )
             cone = Cone(dr.fma(spread, near, width), spread)
         else:
             cone = Cone(0, self.tolerance * 1e-3)  # a single ray: as in an image 1,000 pixels wide

@@ -50,8 +50,9 @@ class Checkpoint:
     def plus(self, other: Checkpoint) -> Checkpoint:
         """Both together; raises ValueError if they do not belong together or overlap."""
         self.require(other.settings)
-        return Checkpoint(self.settings, self.sums.plus(other.sums), self.seconds + other.seconds,
-                          self.about)
+        return Checkpoint(
+            self.settings, self.sums.plus(other.sums), self.seconds + other.seconds, self.about
+        )
 
     def require(self, settings: dict) -> None:
         """Raise ValueError, with one sentence, unless the settings are these."""
@@ -89,11 +90,15 @@ class Checkpoint:
         if sys.byteorder != "little":
             raise OSError("checkpoints are written on little-endian machines only.")
         tensors = {key: getattr(self.sums, key) for key in ARRAYS}
-        text = json.dumps({
-            "settings": self.settings, "about": self.about, "seconds": self.seconds,
-            "passes": self.sums.passes,
-            "arrays": {key: tensor.shape for key, tensor in tensors.items()},
-        }).encode()
+        text = json.dumps(
+            {
+                "settings": self.settings,
+                "about": self.about,
+                "seconds": self.seconds,
+                "passes": self.sums.passes,
+                "arrays": {key: tensor.shape for key, tensor in tensors.items()},
+            }
+        ).encode()
         text += b" " * (-(len(MAGIC) + 8 + len(text)) % ALIGNMENT)
         digest = hashlib.sha256()
         head = MAGIC + struct.pack("<Q", len(text)) + text
@@ -145,8 +150,10 @@ def _read(path) -> bytes:
 def _header(data: bytes, name: str) -> tuple[dict, int]:
     """The JSON text of a file, and where its arrays start."""
     if data.startswith(OTHER_NUMBERS):
-        raise ValueError(f"{name} was rendered with other random numbers, by an earlier version of "
-                         "nil-mitsuba: only that version can go on with it.")
+        raise ValueError(
+            f"{name} was rendered with other random numbers, by an earlier version of "
+            "nil-mitsuba: only that version can go on with it."
+        )
     if not data.startswith(MAGIC):
         raise ValueError(f"{name} is no checkpoint of this version of nil-mitsuba.")
     if len(data) > len(MAGIC) + 8 + 32:

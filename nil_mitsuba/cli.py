@@ -62,8 +62,9 @@ class Duration(click.ParamType):
             float(part) * unit for part, unit in zip(match.groups(), self.UNITS.values()) if part
         )
         if not seconds:
-            self.fail(f'expected a time such as 90s, 30m or 1h30m, and "{value}" is none.', param,
-                      ctx)
+            self.fail(
+                f'expected a time such as 90s, 30m or 1h30m, and "{value}" is none.', param, ctx
+            )
         return seconds
 
 
@@ -114,10 +115,10 @@ class PictureOptions:
     denoise: bool
     compression: str
 
-    def output_to(self, exr_path: Path, png_path: Path | None,
-                  layers: tuple[str, ...]) -> Output:
-        return Output(exr_path, png_path, self.exposure, self.filmic, self.compression,
-                      self.denoise, layers)
+    def output_to(self, exr_path: Path, png_path: Path | None, layers: tuple[str, ...]) -> Output:
+        return Output(
+            exr_path, png_path, self.exposure, self.filmic, self.compression, self.denoise, layers
+        )
 
 
 @dataclass(frozen=True)
@@ -166,8 +167,18 @@ class RenderOptions(PictureOptions):
         if self.layers is not None:
             properties["aovs"] = self.layers
         pass_spp = self.pass_spp or stills.pass_spp_of(sums, self.resume)
-        return jobs.Job(self.scene, self.mode, dict(self.define), properties, self.sensor,
-                        self.seed, rules.spp, pass_spp, denoise=self.denoise, fit=self.fit)
+        return jobs.Job(
+            self.scene,
+            self.mode,
+            dict(self.define),
+            properties,
+            self.sensor,
+            self.seed,
+            rules.spp,
+            pass_spp,
+            denoise=self.denoise,
+            fit=self.fit,
+        )
 
 
 @dataclass(frozen=True)
@@ -195,18 +206,33 @@ def cli():
 
 def picture_options(command):
     """The options on how a picture is written."""
-    for option in reversed((
-        click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too."),
-        click.option("--exposure", type=Range(-png.MAX_EXPOSURE, png.MAX_EXPOSURE),
-                     default=0.0, metavar="STOPS",
-                     help="Brighten the PNG picture by so many stops."),
-        click.option("--filmic", is_flag=True,
-                     help="Let the PNG picture's highlights fade out as film does."),
-        passes_option("--denoise", is_flag=True,
-                     help="Remove noise; the noisy picture stays as a layer."),
-        click.option("--compression", type=click.Choice(list(exr.COMPRESSIONS)), default="zip",
-                     show_default=True, help="Of the EXR file; dwaa and dwab are lossy."),
-    )):
+    for option in reversed(
+        (
+            click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too."),
+            click.option(
+                "--exposure",
+                type=Range(-png.MAX_EXPOSURE, png.MAX_EXPOSURE),
+                default=0.0,
+                metavar="STOPS",
+                help="Brighten the PNG picture by so many stops.",
+            ),
+            click.option(
+                "--filmic",
+                is_flag=True,
+                help="Let the PNG picture's highlights fade out as film does.",
+            ),
+            passes_option(
+                "--denoise", is_flag=True, help="Remove noise; the noisy picture stays as a layer."
+            ),
+            click.option(
+                "--compression",
+                type=click.Choice(list(exr.COMPRESSIONS)),
+                default="zip",
+                show_default=True,
+                help="Of the EXR file; dwaa and dwab are lossy.",
+            ),
+        )
+    ):
         command = option(command)
     return command
 
@@ -217,39 +243,71 @@ def picture_options(command):
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
 )
 @picture_options
-@passes_option("--layers", metavar="A,B,…",
-               help=f"Layers beside the picture: {', '.join(RENDERED)}.")
-@click.option("--spp", type=click.IntRange(1), help="Samples per pixel.  [default: the scene's, "
-              "or with --time or --noise no limit]")
+@passes_option(
+    "--layers", metavar="A,B,…", help=f"Layers beside the picture: {', '.join(RENDERED)}."
+)
+@click.option(
+    "--spp",
+    type=click.IntRange(1),
+    help="Samples per pixel.  [default: the scene's, or with --time or --noise no limit]",
+)
 @passes_option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
-@passes_option("--noise", type=Range(0, min_open=True), metavar="ERROR",
-              help="Stop at this relative error, such as 0.02; pixels that are infinite or not a "
-              "number are left out.")
-@passes_option("--pass-spp", type=click.IntRange(1), help="Samples per pixel in each pass. This "
-              "and --spp, as a file tells them, render its picture again.  [default: by size and "
-              "rules]")
+@passes_option(
+    "--noise",
+    type=Range(0, min_open=True),
+    metavar="ERROR",
+    help="Stop at this relative error, such as 0.02; pixels that are infinite or not a "
+    "number are left out.",
+)
+@passes_option(
+    "--pass-spp",
+    type=click.IntRange(1),
+    help="Samples per pixel in each pass. This "
+    "and --spp, as a file tells them, render its picture again.  [default: by size and "
+    "rules]",
+)
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@passes_option("--checkpoint", metavar="FILE" + SUMS, help="Keep the samples in this file, when "
-              "the picture is done, too.  [default: one beside the picture until it is done]")
+@passes_option(
+    "--checkpoint",
+    metavar="FILE" + SUMS,
+    help="Keep the samples in this file, when "
+    "the picture is done, too.  [default: one beside the picture until it is done]",
+)
 @passes_option("--resume", is_flag=True, help="Go on from the checkpoint, if there is one.")
-@passes_option("--passes", type=PassRange(), help='Render these passes only, into a file for '
-              '"nil-mitsuba merge".')
+@passes_option(
+    "--passes",
+    type=PassRange(),
+    help='Render these passes only, into a file for "nil-mitsuba merge".',
+)
 @passes_option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
 @passes_option("--workers", type=click.IntRange(1), help="Render in so many processes.")
 @click.option("-m", "--mode", metavar="VARIANT", default="llvm_ad_rgb", show_default=True)
 @click.option(
-    "-D", "--define", type=Assignment(), multiple=True,
+    "-D",
+    "--define",
+    type=Assignment(),
+    multiple=True,
     help='Define a constant that the scene refers to as "$key".',
 )
 @click.option(
-    "-s", "--sensor", metavar="INDEX", type=click.IntRange(0), default=0, show_default=True,
+    "-s",
+    "--sensor",
+    metavar="INDEX",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
     help="Sensor to render with, in the scene's order.",
 )
 @click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
 @click.option(
-    "-P", "--property", "properties", metavar="NAME=VALUE", type=Assignment(), multiple=True,
+    "-P",
+    "--property",
+    "properties",
+    metavar="NAME=VALUE",
+    type=Assignment(),
+    multiple=True,
     help='Set a property of the integrator "nil", such as twist=0 or cell_origin=-1,-1,-1.',
 )
 @click.option("--fit", is_flag=True, help="Fit the cell to the scene's bounding box.")
@@ -264,8 +322,13 @@ def render(**options):
 
 @cli.command()
 @click.argument("parts", metavar="PARTS...", nargs=-1, required=True)
-@click.option("-o", "--output", metavar="OUT.exr", required=True,
-              help=f"With the suffix {SUMS}, the parts in one file.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="OUT.exr",
+    required=True,
+    help=f"With the suffix {SUMS}, the parts in one file.",
+)
 @picture_options
 def merge(parts, output, **picture):
     """Join parts that "nil-mitsuba render --passes" has rendered, to a picture."""
@@ -421,8 +484,9 @@ def _still(opened: jobs.Opened, rules: stills.Rules, options: RenderOptions) -> 
     return still
 
 
-def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: Paths,
-                  options: RenderOptions) -> None:
+def _render_still(
+    still: stills.Still, opened: jobs.Opened, about: dict, paths: Paths, options: RenderOptions
+) -> None:
     """Render in passes, until all are done, a rule is met or a signal comes; write the files."""
     sums_path, count, note = paths.sums, still.count, options.note
     first, stop = options.passes or (0, count)
@@ -438,9 +502,15 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
         from . import cluster
 
         job = replace(opened.job, path=os.path.abspath(options.scene), pass_spp=still.passes.spp)
-        parts = cluster.render(still, job, still.todo(state, first, stop), options.scheduler,
-                               options.workers or 1, options.threads,
-                               lambda sentence: note(tidy(sentence)))
+        parts = cluster.render(
+            still,
+            job,
+            still.todo(state, first, stop),
+            options.scheduler,
+            options.workers or 1,
+            options.threads,
+            lambda sentence: note(tidy(sentence)),
+        )
     saver = stills.Saver(sums_path, _note)  # what it says is an error, though not the end
     watch = click.get_current_context().find_object(Watch)
     assert watch, "as main hands it over"
@@ -462,16 +532,21 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
         written = [sums_path] if kept else []
     else:
         written = paths.pictures
-        there = (f'The samples are in "{sums_path}": the same command with --resume writes the '
-                 "picture." if kept else "The samples could not be saved.")
+        there = (
+            f'The samples are in "{sums_path}": the same command with --resume writes the picture.'
+            if kept
+            else "The samples could not be saved."
+        )
         try:
             with stills.interruption(patience=0) as signals:
                 paths.output(options, opened.layers).write(
                     stills.picture_of(state, still.film), metadata_of(state)
                 )
         except KeyboardInterrupt:
-            raise Stopped(f"interrupted before the picture was written. {there}",
-                          next(iter(signals), signal.SIGINT)) from None
+            raise Stopped(
+                f"interrupted before the picture was written. {there}",
+                next(iter(signals), signal.SIGINT),
+            ) from None
         except Exception as error:
             raise click.ClickException(f"{tidy(str(cause_of(error)))} {there}") from error
     for path in written:
@@ -489,14 +564,18 @@ def _render_still(still: stills.Still, opened: jobs.Opened, about: dict, paths: 
         sums_path.unlink(missing_ok=True)
 
 
-def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
-                      options: RenderOptions) -> None:
+def _render_in_one_go(
+    opened: jobs.Opened, about: dict, paths: Paths, options: RenderOptions
+) -> None:
     """Render with a wrapper of Mitsuba's around "nil", which knows no passes."""
-    given = [parameter.opts[0] for parameter in click.get_current_context().command.params
-             if isinstance(parameter, PassesOption) and getattr(options, str(parameter.name))]
+    given = [
+        parameter.opts[0]
+        for parameter in click.get_current_context().command.params
+        if isinstance(parameter, PassesOption) and getattr(options, str(parameter.name))
+    ]
     if given:
         raise click.ClickException(
-            f"{given[0]} is for the integrator \"nil\" itself: one around it renders in one go."
+            f'{given[0]} is for the integrator "nil" itself: one around it renders in one go.'
         )
     job, scene = opened.job, opened.scene
     film = scene.sensors()[job.sensor].film()
@@ -506,8 +585,12 @@ def _render_in_one_go(opened: jobs.Opened, about: dict, paths: Paths,
     dr.sync_thread()
     spp = job.spp or scene.sensors()[job.sensor].sampler().sample_count()
     metadata = about | {
-        "sceneHash": job.scene_hash, "spp": spp, "seed": job.seed, "sensor": job.sensor,
-        "renderTime": time.perf_counter() - start, "variant": mi.variant(),
+        "sceneHash": job.scene_hash,
+        "spp": spp,
+        "seed": job.seed,
+        "sensor": job.sensor,
+        "renderTime": time.perf_counter() - start,
+        "variant": mi.variant(),
         "software": software(stills.versions()),
     }
     channels = [field.name for field in film.bitmap().struct_()]
@@ -573,8 +656,7 @@ class _Bar:
 
 def _paths(scene: Path, options: RenderOptions) -> Paths:
     if options.passes:
-        if (options.png or options.denoise or options.checkpoint or options.noise
-                or options.seconds):
+        if options.png or options.denoise or options.checkpoint or options.noise or options.seconds:
             raise click.UsageError(
                 "--passes renders a part of --spp samples: it goes with none of --png, "
                 "--denoise, --checkpoint, --noise and --time."
@@ -604,7 +686,7 @@ def _require_guides(settings: dict) -> None:
         raise click.ClickException('--denoise needs a film with the pixel format "rgb" or "rgba".')
     if not film["filter"].startswith("BoxFilter") or not set(GUIDES) <= set(settings["layers"]):
         raise click.ClickException(
-            f"--denoise needs the layers {' and '.join(GUIDES)} and the film's filter \"box\": "
+            f'--denoise needs the layers {" and ".join(GUIDES)} and the film\'s filter "box": '
             "render the parts so."
         )
 

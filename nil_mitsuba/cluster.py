@@ -21,8 +21,7 @@ try:
     from distributed.versions import VersionMismatchWarning
 except ModuleNotFoundError:
     raise ModuleNotFoundError(
-        "--scheduler and --workers need the package distributed: "
-        "pip install 'nil-mitsuba[cluster]'"
+        "--scheduler and --workers need the package distributed: pip install 'nil-mitsuba[cluster]'"
     ) from None
 
 from . import jobs, stills
@@ -61,9 +60,15 @@ class Refused(Exception):
         self.address, self.sentence = address, sentence
 
 
-def render(still: stills.Still, job: Job, indices: Iterable[int], scheduler: str | None = None,
-           workers: int = 1, threads: int | None = None,
-           complain: Callable[[str], None] = print) -> Generator[Checkpoint, None, None]:
+def render(
+    still: stills.Still,
+    job: Job,
+    indices: Iterable[int],
+    scheduler: str | None = None,
+    workers: int = 1,
+    threads: int | None = None,
+    complain: Callable[[str], None] = print,
+) -> Generator[Checkpoint, None, None]:
     """Passes of `still`, which `job` describes, rendered by the cluster at ``scheduler``.
 
     Without a scheduler, ``workers`` processes are started here. Yields parts as they come, in any
@@ -122,16 +127,17 @@ class Queue:
 class Hands:
     """The workers of a cluster: parts go to those that fit, and come back in any order."""
 
-    def __init__(self, client, job: Job, queue: Queue, threads: int | None,
-                 complain: Callable[[str], None]):
+    def __init__(
+        self, client, job: Job, queue: Queue, threads: int | None, complain: Callable[[str], None]
+    ):
         self.client, self.job, self.queue, self.threads = client, job, queue, threads
         self.complain = complain
         self.versions = versions()
-        self.fit: set[str] = set()           # Addresses of workers that are there and fit
-        self.refused: dict[str, str] = {}    # Those that do not, and why
-        self.flying: dict = {}               # Passes and workers of each future
+        self.fit: set[str] = set()  # Addresses of workers that are there and fit
+        self.refused: dict[str, str] = {}  # Those that do not, and why
+        self.flying: dict = {}  # Passes and workers of each future
         self.losses: dict[tuple[int, int], int] = {}
-        self.seconds: float | None = None    # Of a pass, once one has come
+        self.seconds: float | None = None  # Of a pass, once one has come
         self.waiting = False
 
     def parts(self) -> Generator[bytes | None, None, None]:
@@ -178,10 +184,15 @@ class Hands:
                     self.fit.add(address)
         if not self.fit and self.seconds is None:
             if self.refused:
-                raise ValueError("no worker of the cluster can render this: " + "; ".join(
-                    f"{address}: {sentence}" for address, sentence in self.refused.items()) + ".")
+                raise ValueError(
+                    "no worker of the cluster can render this: "
+                    + "; ".join(
+                        f"{address}: {sentence}" for address, sentence in self.refused.items()
+                    )
+                    + "."
+                )
             if not new:
-                raise OSError("the cluster has no workers: start some with \"dask worker\".")
+                raise OSError('the cluster has no workers: start some with "dask worker".')
         if not self.fit and not self.waiting:
             self.complain("no worker is left that can render this: waiting for one to come.")
         self.waiting = not self.fit
@@ -279,14 +290,17 @@ def difference(theirs: dict[str, str], ours: dict[str, str]) -> str:
     """What a worker would need, as a sentence without an end; "" if it has the same versions."""
     return ", ".join(
         f"it has {name} {theirs.get(name, 'of no version')}, and here is {version}"
-        for name, version in ours.items() if theirs.get(name) != version
+        for name, version in ours.items()
+        if theirs.get(name) != version
     )
 
 
 def _killing(part: tuple[int, int], address: str | None = None) -> str:
     last = f", the last of them {address}" if address else ""
-    return (f"every worker that took the passes {name_passes([part])} ended{last}: its log may say "
-            "why; too little memory is a common reason.")
+    return (
+        f"every worker that took the passes {name_passes([part])} ended{last}: its log may say "
+        "why; too little memory is a common reason."
+    )
 
 
 # -------------------------------------------------------------------- connection
@@ -302,10 +316,16 @@ def _connected(scheduler: str | None, workers: int):
         warnings.simplefilter("ignore", VersionMismatchWarning)
         if scheduler is None:
             # No limit of memory: passes have theirs
-            scheduler = stack.enter_context(distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, memory_limit=None,
-                dashboard_address="127.0.0.1:0", preload=__name__, silence_logs=logging.CRITICAL,
-            ))
+            scheduler = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    memory_limit=None,
+                    dashboard_address="127.0.0.1:0",
+                    preload=__name__,
+                    silence_logs=logging.CRITICAL,
+                )
+            )
         try:
             client = distributed.Client(scheduler, timeout=CONNECT_SECONDS)
         except (OSError, ValueError) as error:

@@ -39,15 +39,37 @@ PART_NAMES = ("rgba", "data")  # Nuke calls its own main part "rgba", too
 HALF_MAX = 65504.0  # largest number of float16
 
 # Attributes that say how pixels are stored.
-STRUCTURE = frozenset({
-    "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
-    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version",
-})
+STRUCTURE = frozenset(
+    {
+        "channels",
+        "chunkCount",
+        "compression",
+        "dataWindow",
+        "displayWindow",
+        "lineOrder",
+        "name",
+        "pixelAspectRatio",
+        "screenWindowCenter",
+        "screenWindowWidth",
+        "tiles",
+        "type",
+        "version",
+    }
+)
 
 # Metadata in the order in which people ask for them; others follow by name.
 FIRST = (
-    "commandLine", "scene", "sceneHash", "spp", "seed", "passes", "renderTime", "capDate",
-    "utcOffset", "software", "variant",
+    "commandLine",
+    "scene",
+    "sceneHash",
+    "spp",
+    "seed",
+    "passes",
+    "renderTime",
+    "capDate",
+    "utcOffset",
+    "software",
+    "variant",
 )
 
 

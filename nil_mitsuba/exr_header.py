@@ -17,21 +17,49 @@ LONGEST_NAME = 255
 
 # Attributes that each header must have, and their types.
 REQUIRED = {
-    "channels": "chlist", "compression": "compression", "dataWindow": "box2i",
+    "channels": "chlist",
+    "compression": "compression",
+    "dataWindow": "box2i",
     "displayWindow": "box2i",
 }
 
 COMPRESSION_NAMES = (  # by their number in a file
-    "none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab",
+    "none",
+    "rle",
+    "zips",
+    "zip",
+    "piz",
+    "pxr24",
+    "b44",
+    "b44a",
+    "dwaa",
+    "dwab",
 )
 PIXEL_TYPES = ("uint32", "float16", "float32")
 
 # Types of attributes that are a number or a few.
 _NUMBERS = {
-    "box2f": "<4f", "box2i": "<4i", "chromaticities": "<8f", "compression": "<B", "double": "<d",
-    "envmap": "<B", "float": "<f", "int": "<i", "lineOrder": "<B", "m33d": "<9d", "m33f": "<9f",
-    "m44d": "<16d", "m44f": "<16f", "rational": "<iI", "tiledesc": "<IIB", "v2d": "<2d",
-    "v2f": "<2f", "v2i": "<2i", "v3d": "<3d", "v3f": "<3f", "v3i": "<3i",
+    "box2f": "<4f",
+    "box2i": "<4i",
+    "chromaticities": "<8f",
+    "compression": "<B",
+    "double": "<d",
+    "envmap": "<B",
+    "float": "<f",
+    "int": "<i",
+    "lineOrder": "<B",
+    "m33d": "<9d",
+    "m33f": "<9f",
+    "m44d": "<16d",
+    "m44f": "<16f",
+    "rational": "<iI",
+    "tiledesc": "<IIB",
+    "v2d": "<2d",
+    "v2f": "<2f",
+    "v2i": "<2i",
+    "v3d": "<3d",
+    "v3f": "<3f",
+    "v3i": "<3i",
 }
 
 

@@ -17,13 +17,24 @@ from math import factorial, pi
 
 import drjit as dr
 
-__all__ = ["Connection", "area_density", "connect", "conormal", "flow", "from_frame", "inverse",
-           "multiply", "to_frame", "wrap"]
+__all__ = [
+    "Connection",
+    "area_density",
+    "connect",
+    "conormal",
+    "flow",
+    "from_frame",
+    "inverse",
+    "multiply",
+    "to_frame",
+    "wrap",
+]
 
 
 # ---------------------------------------------------------------------------
 #  Group and frame
 # ---------------------------------------------------------------------------
+
 
 def multiply(p, q, twist=1):
     """Product ``p·q``: the left translation by ``p`` applied to ``q``.
@@ -64,6 +75,7 @@ def conormal(p, n, twist=1):
 #  Elementary functions of the half turn v
 # ---------------------------------------------------------------------------
 
+
 def _is_double(x):
     # The components of scalar arrays, of 32 bit too, are Python floats
     return not dr.is_array_v(x) or dr.type_v(x) == dr.VarType.Float64
@@ -78,13 +90,14 @@ def _polynomial(y, coefficients):
 
 def _cos_series(y, double):
     # On v² = y ≤ 2.5 the first term left out is below 7e-9, or 2e-17
-    return _polynomial(y, [(-1)**n / factorial(2*n) for n in range(11 if double else 7)])
+    return _polynomial(y, [(-1) ** n / factorial(2 * n) for n in range(11 if double else 7)])
 
 
 def _g_series(y, double):
     # On v² = y ≤ 2.5 the first term left out is below 7e-9 of the sum, or 2e-17
-    return _polynomial(y, [(-1)**n * (2*n + 2) / factorial(2*n + 3)
-                           for n in range(10 if double else 6)])
+    return _polynomial(
+        y, [(-1) ** n * (2 * n + 2) / factorial(2 * n + 3) for n in range(10 if double else 6)]
+    )
 
 
 def _length(x, y):
@@ -130,6 +143,7 @@ def _lift(sinc, c, g):
 #  Geodesics
 # ---------------------------------------------------------------------------
 
+
 def flow(p, v, t, twist=1):
     """Point and direction after the arc length ``t`` along the geodesic from ``p`` along ``v``.
 
@@ -154,8 +168,8 @@ def short_flow(p, v, t, h, twist=1):
     half = 0.5 * turn * h
     y = dr.square(half)
     # On y ≤ 1/4 the first terms left out are below 3e-10 and 1e-9
-    c = _polynomial(y, [(-1)**n / factorial(2*n) for n in range(5)])
-    g = _polynomial(y, [(-1)**n * (2*n + 2) / factorial(2*n + 3) for n in range(4)])
+    c = _polynomial(y, [(-1) ** n / factorial(2 * n) for n in range(5)])
+    g = _polynomial(y, [(-1) ** n * (2 * n + 2) / factorial(2 * n + 3) for n in range(4)])
     sinc = dr.fma(y, g, c)
     c2 = dr.fma(v.x, v.x, v.y * v.y)
     middle = turned(v, turn * dr.fma(0.5, h, t))
@@ -207,6 +221,7 @@ class Connection:
     ``direction``, ``arrival``: unit frame directions where it leaves and where it arrives, both
     pointing from the first point to the second; ``distance`` in cells; ``area_density`` in cells².
     """
+
     direction: object
     arrival: object
     distance: object
@@ -255,13 +270,22 @@ def connect(p, q, twist=1):
         s, c, _, _, _ = _on_quarter(x)
         v, c = pi - x, -c
         radius = dr.maximum(R, _ON_FIBRE[_is_double(R)]) / s
-        return (s, c, s / v, (s - v * c) / (v * dr.square(v)), 2 * radius * v / k,
-                dr.copysign(2 * v / k, height))
+        return (
+            s,
+            c,
+            s / v,
+            (s - v * c) / (v * dr.square(v)),
+            2 * radius * v / k,
+            dr.copysign(2 * v / k, height),
+        )
 
     # A branch: it costs as much as the rest, and few points lie beyond
     s, c, sinc, g, horizontal, vertical = dr.if_stmt(
-        (R, zeta, zeta_lost, height, k, near), zeta > zeta_quarter, far,
-        lambda R, zeta, zeta_lost, height, k, near: near)
+        (R, zeta, zeta_lost, height, k, near),
+        zeta > zeta_quarter,
+        far,
+        lambda R, zeta, zeta_lost, height, k, near: near,
+    )
 
     distance = _length(horizontal, vertical)
     inv_distance = dr.rcp(dr.select(distance > 0, distance, 1.0))
@@ -272,10 +296,12 @@ def connect(p, q, twist=1):
     chord_x, chord_y = dr.select(r > 0, dx * inv_r, -1), dy * inv_r
     # In azimuth v before the chord at the start, v past it on arrival
     along, across = a * c, a * s * orientation
-    direction = type(p)(dr.fma(chord_x, along, chord_y * across),
-                        dr.fma(chord_y, along, -chord_x * across), w)
-    arrival = type(p)(dr.fma(chord_x, along, -chord_y * across),
-                      dr.fma(chord_y, along, chord_x * across), w)
+    direction = type(p)(
+        dr.fma(chord_x, along, chord_y * across), dr.fma(chord_y, along, -chord_x * across), w
+    )
+    arrival = type(p)(
+        dr.fma(chord_x, along, -chord_y * across), dr.fma(chord_y, along, chord_x * across), w
+    )
     density = _area_density(distance, sinc, g, dr.square(0.5 * k * horizontal))
     return Connection(direction, arrival, distance, density)
 
@@ -289,8 +315,10 @@ _ON_FIBRE = {False: 1e-15, True: 1e-60}
 _NEWTON_STEPS = {False: 2, True: 3}
 
 # 2π in two parts, the second what the first lacks
-_TWO_PI = {False: (6.2831854820251465, -1.7484555e-07),
-           True: (6.283185307179586, 2.4492935982947064e-16)}
+_TWO_PI = {
+    False: (6.2831854820251465, -1.7484555e-07),
+    True: (6.283185307179586, 2.4492935982947064e-16),
+}
 
 
 def _near_half_turn(R, zeta, zeta_quarter):
@@ -301,7 +329,7 @@ def _near_half_turn(R, zeta, zeta_quarter):
     R2 = dr.square(R)
     # μ(v)/v runs from 2/3 to 1 at π/2: its limit for large R, fitted in (ζ / ζ(π/2))²
     quarter = dr.minimum(dr.square(zeta / zeta_quarter), 1)
-    x = zeta / dr.fma(R2, dr.fma(quarter, dr.fma(quarter, -0.16, 0.493), 2/3), 2)
+    x = zeta / dr.fma(R2, dr.fma(quarter, dr.fma(quarter, -0.16, 0.493), 2 / 3), 2)
     for _ in range(_NEWTON_STEPS[_is_double(R)]):
         _, _, mu, slope = _mu(x)
         x = x - (dr.fma(R2, mu, 2 * x) - zeta) / dr.fma(R2, slope, 2)
@@ -326,8 +354,8 @@ def _far_half_turn(R, zeta, zeta_lost):
     h = dr.fma(-pi / 3, R2, excess) * inv_slope / unit
     # Root of x²(x + h) = 1 to 1e-2, by what it tends to at h = 0 and at h = ±∞
     h_pos, h_neg = dr.maximum(h, 0), dr.maximum(-h, 0)
-    root_pos = dr.rsqrt(h_pos + dr.rsqrt(dr.fma(2/3, h_pos, 1)))
-    root_neg = h_neg + dr.rcp(dr.fma(h_neg, dr.fma(0.5, h_neg, 2/3), 1))
+    root_pos = dr.rsqrt(h_pos + dr.rsqrt(dr.fma(2 / 3, h_pos, 1)))
+    root_neg = h_neg + dr.rcp(dr.fma(h_neg, dr.fma(0.5, h_neg, 2 / 3), 1))
     x = dr.minimum(unit * dr.select(h > 0, root_pos, root_neg), pi / 2)
 
     for _ in range(_NEWTON_STEPS[double]):
@@ -361,6 +389,7 @@ def _on_quarter(x):
 #  Unit cell
 # ---------------------------------------------------------------------------
 
+
 def wrap(p, twist=1):
     """The image of ``p`` in the unit cell and the deck element that leads back to ``p``.
 
@@ -383,8 +412,11 @@ def wrap(p, twist=1):
     extra = dr.floor(z)
     z = dr.minimum(z - extra, below_one)
     z_cell = z_cell - rise_cell + extra
-    cell_t = dr.int64_array_t(type(p)) if dr.type_v(p) == dr.VarType.Float64 \
+    cell_t = (
+        dr.int64_array_t(type(p))
+        if dr.type_v(p) == dr.VarType.Float64
         else dr.int32_array_t(type(p))
+    )
     if not dr.is_jit_v(p):
         return type(p)(x, y, z), cell_t(int(x_cell), int(y_cell), int(z_cell))
     return type(p)(x, y, z), cell_t(x_cell, y_cell, z_cell)

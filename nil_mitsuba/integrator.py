@@ -103,8 +103,10 @@ class NilIntegrator(ADIntegrator):
 
         They do not say which sensor the ray is from: it is taken for a ray of the scene's first.
         """
-        mi.Log(mi.LogLevel.Warn, "nil: inside another integrator; if that is aov, its own layers "
-                                 "are traced straight.")
+        mi.Log(
+            mi.LogLevel.Warn,
+            "nil: inside another integrator; if that is aov, its own layers are traced straight.",
+        )
         view = View(scene, self)
         camera = Camera(scene.sensors()[0], view.space, self.tolerance)
         p, v, cone, far = camera.start(ray, mi.Float(0))
@@ -129,8 +131,17 @@ class NilIntegrator(ADIntegrator):
     # ------------------------------------------------------------- path tracing
 
     @dr.syntax
-    def trace(self, view: View, sampler: mi.Sampler, ray: mi.RayDifferential3f, p: mi.Point3f,
-              v: mi.Vector3f, cone: Cone, far: mi.Float, active: mi.Bool):
+    def trace(
+        self,
+        view: View,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        p: mi.Point3f,
+        v: mi.Vector3f,
+        cone: Cone,
+        far: mi.Float,
+        active: mi.Bool,
+    ):
         """Radiance along the geodesics from ``p`` (cells) in frame direction ``v``.
 
         What lies beyond the length ``far`` (cells) is hidden from the camera. Returns the radiance,
@@ -145,6 +156,7 @@ class NilIntegrator(ADIntegrator):
 
         # --------------------- Configure loop state ----------------------
 
+        # fmt: off
         p, v = mi.Point3f(p), mi.Vector3f(v)   # Start of the current segment, cells and frame
         cone = Cone(cone.width, cone.spread, cone.soft)   # How far off the segment may be
         depth = mi.UInt32(0)                   # Depth of current vertex
@@ -162,6 +174,7 @@ class NilIntegrator(ADIntegrator):
         spent           = mi.Float(0)          # Length of the camera segment before hidden lights
         far             = dr.minimum(far, tracer.max_distance)
         seen            = view.nothing_seen()  # Layers
+        # fmt: on
 
         if self.hide_emitters:
             p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, far, active)
@@ -211,8 +224,12 @@ class NilIntegrator(ADIntegrator):
             # ------ Evaluate BSDF * cos(theta) and sample direction -------
 
             bsdf_val, bsdf_pdf, bsdf_sample, bsdf_weight = bsdf.eval_pdf_sample(
-                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d(),
-                active & si.is_valid()  # at the last vertex, whether it is seen through counts
+                bsdf_ctx,
+                si,
+                wo,
+                sampler.next_1d(),
+                sampler.next_2d(),
+                active & si.is_valid(),  # at the last vertex, whether it is seen through counts
             )
 
             # --------------- Emitter sampling contribution ----------------
@@ -222,8 +239,11 @@ class NilIntegrator(ADIntegrator):
                 Lr_dir = β * bsdf_val * light.weight * mis_em
                 active_em &= dr.any(Lr_dir != 0)
                 penumbra = dr.minimum(PENUMBRA * light.angle, 1)
-                spread = dr.select(cone.soft, view.rough_spread,
-                                   dr.maximum(cone.spread, view.rough_spread * penumbra))
+                spread = dr.select(
+                    cone.soft,
+                    view.rough_spread,
+                    dr.maximum(cone.spread, view.rough_spread * penumbra),
+                )
                 active_em &= self._visible(view, si, margin, light, Cone(width, spread), active_em)
                 L += dr.select(active_em, Lr_dir, 0)
 
@@ -233,8 +253,9 @@ class NilIntegrator(ADIntegrator):
             p = offset(si.p, si.n, v, margin, space)
             β *= bsdf_weight
             η *= bsdf_sample.eta
-            valid |= active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type,
-                                                           mi.BSDFFlags.Null)
+            valid |= (
+                active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+            )
 
             # Information about the current vertex needed by the next iteration
             vertex_prev = space.to_cells(si.p)
@@ -270,8 +291,9 @@ class NilIntegrator(ADIntegrator):
         start = offset(si.p, si.n, light.direction, margin, space)
         if space.quotient:
             start, home = geometry.wrap(start, space.twist)
-            p = geometry.multiply(mi.Point3f(geometry.inverse(home, space.integer_twist)), p,
-                                  space.twist)
+            p = geometry.multiply(
+                mi.Point3f(geometry.inverse(home, space.integer_twist)), p, space.twist
+            )
         reach = light.reach
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))
@@ -292,8 +314,9 @@ class NilIntegrator(ADIntegrator):
             start = offset(si.p, si.n, hit.arrival, view.margin(hit, si), space)
             p = dr.select(active, start, p)
             v = dr.select(active, hit.arrival, v)
-            cone.width = dr.select(active, dr.fma(cone.spread, hit.distance, cone.width),
-                                   cone.width)
+            cone.width = dr.select(
+                active, dr.fma(cone.spread, hit.distance, cone.width), cone.width
+            )
             spent = dr.select(active, spent + hit.distance, spent)
         return p, v, cone, spent
 
@@ -306,20 +329,23 @@ def _warn_of_what_is_ignored(scene, shapes, integrator):
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
     for shape, extent in zip(shapes.shapes, shapes.extents):
         if extent.lost:
-            mi.Log(mi.LogLevel.Warn,
-                   f"nil: of the shape {name_of(shape)}, {extent.lost}: they are never seen.")
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"nil: of the shape {name_of(shape)}, {extent.lost}: they are never seen.",
+            )
         reach = 0
         if integrator.quotient and extent.box.valid():
             box = extent.box
             reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
         if reach > margin:
-            mi.Log(mi.LogLevel.Warn,
-                   f"nil: the shape {name_of(shape)} reaches {reach:.4g} scene units out of the "
-                   f"cube {lower} to {upper}: what lies outside is never seen. Move it, or set "
-                   "cell_origin and cell_size.")
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"nil: the shape {name_of(shape)} reaches {reach:.4g} scene units out of the "
+                f"cube {lower} to {upper}: what lies outside is never seen. Move it, or set "
+                "cell_origin and cell_size.",
+            )
         if shape.is_medium_transition():
-            mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is "
-                                     "ignored.")
+            mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is ignored.")
     for kind, endpoints in (("sensor", scene.sensors()), ("emitter", scene.emitters())):
         for endpoint in endpoints:
             if endpoint.get_medium() is not None:
@@ -337,8 +363,12 @@ class View:
                 "keep when the scene changes: render without dr.freeze."
             )
         self.scene = scene
-        self.space = Space(integrator.twist, integrator.quotient, list(integrator.cell_origin),
-                           integrator.cell_size)
+        self.space = Space(
+            integrator.twist,
+            integrator.quotient,
+            list(integrator.cell_origin),
+            integrator.cell_size,
+        )
         self.shapes = Shapes(scene)
         self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes)
         self.lights = Lights(scene, self.space, integrator.max_distance)
@@ -355,6 +385,7 @@ class View:
 
     def nothing_seen(self) -> dict[str, list]:
         """The channels of each layer where a path meets nothing."""
+
         def nothing(layer):
             mean = LAYERS[layer].rule == "mean"
             return mi.Float(0) if mean else mi.Int32(-(layer == "shape"))

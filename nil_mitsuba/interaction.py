@@ -23,8 +23,9 @@ def unit_conormal(p: mi.Point3f, n: mi.Normal3f, space: Space) -> mi.Normal3f:
     return conormal * dr.rsqrt(dr.maximum(dr.squared_norm(conormal), 1e-30))
 
 
-def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
-                        wavelengths) -> mi.SurfaceInteraction3f:
+def surface_interaction(
+    hit: Hit, start_direction: mi.Vector3f, space: Space, wavelengths
+) -> mi.SurfaceInteraction3f:
     """Surface interaction of a geodesic's hit: ``p`` in scene coordinates, all directions in frame.
 
     ``n``, ``sh_frame``, ``dp_du``, ``dp_dv`` and ``wi`` are frame components (Mitsuba computes no
@@ -63,8 +64,9 @@ def surface_interaction(hit: Hit, start_direction: mi.Vector3f, space: Space,
     return si
 
 
-def offset(p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, margin: mi.Float, space: Space
-           ) -> mi.Point3f:
+def offset(
+    p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, margin: mi.Float, space: Space
+) -> mi.Point3f:
     """Start (cells) of a ray that leaves a surface point ``p`` (scene) in frame direction ``d``.
 
     The point is moved by ``margin`` (scene units), to the side that ``d`` points to, along the

@@ -58,8 +58,9 @@ class Opened(NamedTuple):
     def still(self, rules: Rules) -> Still:
         """What is to be rendered; raises ValueError if the integrator is not "nil" itself."""
         job = self.job
-        return Still(self.scene, job.sensor, self.integrator, job.seed, rules, job.pass_spp,
-                     job.scene_hash)
+        return Still(
+            self.scene, job.sensor, self.integrator, job.seed, rules, job.pass_spp, job.scene_hash
+        )
 
 
 def open_scene(job: Job, note: Callable[[str], None] = lambda _: None) -> Opened:

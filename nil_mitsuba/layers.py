@@ -15,8 +15,8 @@ class Layer(NamedTuple):
     """Names of a layer's channels, how samples combine, and the type that stores them in a file."""
 
     channels: tuple[str, ...]
-    rule: Rule | None     # None: not rendered, but made of the picture
-    storage: str | None   # None: as the picture is stored
+    rule: Rule | None  # None: not rendered, but made of the picture
+    storage: str | None  # None: as the picture is stored
 
 
 # A layer's name in a file is what precedes the last dot. What follows it has one letter, since
@@ -45,5 +45,9 @@ GUIDES = ("albedo", "normal")
 
 def channel_names(layers: Iterable[str], rule: Rule | None = None) -> list[str]:
     """Names of the channels of ``layers``, or of those among them with one rule."""
-    return [channel for name in layers if rule in (None, LAYERS[name].rule)
-            for channel in LAYERS[name].channels]
+    return [
+        channel
+        for name in layers
+        if rule in (None, LAYERS[name].rule)
+        for channel in LAYERS[name].channels
+    ]

@@ -25,8 +25,12 @@ AREA = ("AreaLight",)
 DARK = ("DirectionalArea",)
 POINT = ("PointLight", "SpotLight", "Projector")
 DIRECTIONAL = ("DirectionalEmitter",)
-ENVIRONMENT = ("ConstantBackgroundEmitter", "EnvironmentMapEmitter", "SunskyEmitter",
-               "TimedSunskyEmitter")
+ENVIRONMENT = (
+    "ConstantBackgroundEmitter",
+    "EnvironmentMapEmitter",
+    "SunskyEmitter",
+    "TimedSunskyEmitter",
+)
 
 
 # By what part of its length a geodesic may end beside the point it was connected to: 30 roundings.
@@ -87,8 +91,9 @@ class Images:
         self.height = dr.opaque(mi.Float, max_distance * (1 + 0.16 * k * max_distance) + 0.5)
         # Near a fibre the light that comes from beyond the height 2π/k is to that from below as
         # (2/π) atan √((k T/2π)² − 1) to 1 (∫ dz/A); a tenth before, as A falls towards it.
-        beyond = 2 / math.pi * math.atan(math.sqrt(max((k * max_distance / (2 * math.pi)) ** 2 - 1,
-                                                       0)))
+        beyond = (
+            2 / math.pi * math.atan(math.sqrt(max((k * max_distance / (2 * math.pi)) ** 2 - 1, 0)))
+        )
         self.focused = dr.opaque(mi.Float, max(beyond / (1 + beyond), 0.1) if k else 0)
         self.focus = dr.opaque(mi.Float, 2 * math.pi / k if k else 1)
 
@@ -125,8 +130,9 @@ class Images:
         column = dr.maximum(1 - 4 * across, 0) * self.COLUMN / (2 * self.COLUMN + dr.sqrt(across))
         return mi.Vector3i(gx, gy, gz), share, column
 
-    def choose(self, p: mi.Point3f, q: mi.Point3f, u1: mi.Float, u2: mi.Point2f
-               ) -> tuple[mi.Vector3i, mi.Float]:
+    def choose(
+        self, p: mi.Point3f, q: mi.Point3f, u1: mi.Float, u2: mi.Point2f
+    ) -> tuple[mi.Vector3i, mi.Float]:
         """A deck element and its probability."""
         s, R, Z = self.SOFTENING, self.radius, self.height
         near, share, column = self._nearest(p, q)
@@ -149,8 +155,11 @@ class Images:
         take_focus = u4 < focused
         u4 = dr.select(take_focus, u4 / focused, (u4 - focused) / (1 - focused))
         angle = dr.lerp(self._about_focus(mi.Float(0)), self._about_focus(Z), u4)
-        z = dr.select(take_focus, self.focus * (1 + dr.tan(angle) / 3),
-                      sigma * dr.tan(u4 * dr.atan(Z / sigma)))
+        z = dr.select(
+            take_focus,
+            self.focus * (1 + dr.tan(angle) / 3),
+            sigma * dr.tan(u4 * dr.atan(Z / sigma)),
+        )
         z = dr.copysign(z, u3)
         gz = dr.round(z - offset)
 
@@ -175,12 +184,18 @@ class Images:
         def in_z(t):
             low, high = self._about_focus(mi.Float(0)), self._about_focus(Z)
             about = (self._about_focus(dr.abs(t)) - low) / (high - low)
-            return dr.copysign(dr.lerp(dr.atan(dr.abs(t) / sigma) / dr.atan(Z / sigma), about,
-                                       self._focus_share(x, y)), t)
+            return dr.copysign(
+                dr.lerp(
+                    dr.atan(dr.abs(t) / sigma) / dr.atan(Z / sigma), about, self._focus_share(x, y)
+                ),
+                t,
+            )
 
         across = (
-            interval(in_x, x, R) / (2 * dr.log(1 + R / s))
-            * interval(lambda t: dr.asinh(t / rho), y, R) / (2 * dr.asinh(R / rho))
+            interval(in_x, x, R)
+            / (2 * dr.log(1 + R / s))
+            * interval(lambda t: dr.asinh(t / rho), y, R)
+            / (2 * dr.asinh(R / rho))
         )
         is_column = (g.x == near.x) & (g.y == near.y)
         across = dr.fma(1 - column, across, dr.select(is_column, column, 0))
@@ -202,7 +217,7 @@ class Lights:
             if name not in AREA + DARK + POINT + DIRECTIONAL + ENVIRONMENT:
                 raise RuntimeError(
                     f'the integrator "nil" has no meaning for the emitter "{name}"'
-                    f'{f" ({emitter.id()})" if emitter.id() else ""}: use area, point, spot, '
+                    f"{f' ({emitter.id()})' if emitter.id() else ''}: use area, point, spot, "
                     "projector, directional, constant, envmap or sunsky."
                 )
         self.has_area = any(name in AREA for name in names)
@@ -219,8 +234,9 @@ class Lights:
         self.pmf = 1 / len(emitters) if self.uniform and emitters else 0
         self.weight_scale = 1 / sum(weights) if weights and not self.uniform else 0
         # All that is not minimising has half turns beyond π: arcs longer than 2π/|k|
-        self.has_further = space.twist_number != 0 and \
-            abs(space.twist_number) * max_distance > 2 * math.pi
+        self.has_further = (
+            space.twist_number != 0 and abs(space.twist_number) * max_distance > 2 * math.pi
+        )
         if self.has_point:
             self.positions = self._point_positions(emitters, names)
         self.images = Images(space, max_distance) if space.quotient else None
@@ -246,8 +262,11 @@ class Lights:
         densities = [0.0] * (max(pointers) + 1)
         margins = [0.0] * len(emitters)
         # As the scene knows them: an emitter's own shape may not tell that it is a mesh
-        shapes = {dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter()))[0]: shape
-                  for shape in self.scene.shapes() if shape.is_emitter()}
+        shapes = {
+            dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter()))[0]: shape
+            for shape in self.scene.shapes()
+            if shape.is_emitter()
+        }
         textures = [-1] * len(densities)
         for i, (emitter, name, pointer) in enumerate(zip(emitters, names, pointers)):
             if name not in AREA:
@@ -279,13 +298,18 @@ class Lights:
                 centres[i], sides[i] = list(centre), side[0]
         if not any(sides):
             return None
-        return opaque((mi.Point3f(*(mi.Float([c[axis] for c in centres]) for axis in range(3))),
-                       mi.Float(sides)))
+        return opaque(
+            (
+                mi.Point3f(*(mi.Float([c[axis] for c in centres]) for axis in range(3))),
+                mi.Float(sides),
+            )
+        )
 
     # ---------------------------------------------------------------- sampling
 
-    def sample(self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Bool
-               ) -> LightSample:
+    def sample(
+        self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Bool
+    ) -> LightSample:
         """Draw light that may arrive at a surface; visibility is left to the caller."""
         scene, space = self.scene, self.space
         p = space.to_cells(si.p)
@@ -322,10 +346,14 @@ class Lights:
 
     def _sample_infinite(self, emitter, si, u, active):
         ds, weight = emitter.sample_direction(si, u, active)
-        return LightSample(mi.Vector3f(ds.d), mi.Float(dr.inf),
-                           dr.select(ds.pdf > 0, weight, 0),
-                           dr.select(ds.delta, 0, ds.pdf), mi.Bool(ds.delta),
-                           dr.select(ds.delta, 0, lobe_angle(ds.pdf)))
+        return LightSample(
+            mi.Vector3f(ds.d),
+            mi.Float(dr.inf),
+            dr.select(ds.pdf > 0, weight, 0),
+            dr.select(ds.delta, 0, ds.pdf),
+            mi.Bool(ds.delta),
+            dr.select(ds.delta, 0, lobe_angle(ds.pdf)),
+        )
 
     def _image_of(self, p, q, u1, u2):
         """An image (cells) of the point ``q`` of the unit cube, and its probability."""
@@ -370,9 +398,14 @@ class Lights:
         margin = dr.gather(mi.Float, self.area_margins, index, active) / space.size
         margin = dr.fma(ARRIVAL_ROUNDING, way.distance, margin)
         reach = way.distance - margin / dr.maximum(cosine, GRAZING)
-        return LightSample(direction, reach,
-                           dr.select(pdf > 0, radiance * dr.rcp(pdf), 0), pdf, mi.Bool(False),
-                           lobe_angle(density))
+        return LightSample(
+            direction,
+            reach,
+            dr.select(pdf > 0, radiance * dr.rcp(pdf), 0),
+            pdf,
+            mi.Bool(False),
+            lobe_angle(density),
+        )
 
     def _sample_point(self, emitter, light, si, p, u, u1, u2, active):
         space = self.space
@@ -411,13 +444,23 @@ class Lights:
         intensity *= dr.square(L)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
         reach = way.distance * (1 - ARRIVAL_ROUNDING)
-        return LightSample(mi.Vector3f(way.direction), reach, weight, mi.Float(0),
-                           mi.Bool(True), mi.Float(0))
+        return LightSample(
+            mi.Vector3f(way.direction), reach, weight, mi.Float(0), mi.Bool(True), mi.Float(0)
+        )
 
     # ------------------------------------------------------------------ weights
 
-    def pdf(self, hit: Hit, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr, p: mi.Point3f,
-            start: mi.Point3f, v: mi.Vector3f, g: mi.Vector3i, active: mi.Bool) -> mi.Float:
+    def pdf(
+        self,
+        hit: Hit,
+        si: mi.SurfaceInteraction3f,
+        emitter: mi.EmitterPtr,
+        p: mi.Point3f,
+        start: mi.Point3f,
+        v: mi.Vector3f,
+        g: mi.Vector3i,
+        active: mi.Bool,
+    ) -> mi.Float:
         """Solid-angle density with which `sample` at ``p`` (cells) draws the light just found.
 
         The segment that found it started at ``start``, beside ``p``, in the frame direction ``v``.
@@ -427,8 +470,7 @@ class Lights:
         result = mi.Float(0)
         if self.has_area:
             lit = active & hit.valid
-            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, start, v, g, lit),
-                               result)
+            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, start, v, g, lit), result)
         environment = self.scene.environment()
         if environment is not None:
             ds = dr.zeros(mi.DirectionSample3f)
@@ -453,8 +495,12 @@ class Lights:
             texture = dr.gather(mi.Int32, self.texture_numbers, number, lit)
             varying = lit & (texture >= 0)
             # Not an array of textures, of which every kind that lives in the process would answer
-            per_uv = dr.switch(dr.select(varying, mi.UInt32(texture), 0),
-                               [texture.pdf_position for texture in self.textures], si.uv, varying)
+            per_uv = dr.switch(
+                dr.select(varying, mi.UInt32(texture), 0),
+                [texture.pdf_position for texture in self.textures],
+                si.uv,
+                varying,
+            )
             textured = per_uv / dr.norm(dr.cross(si.dp_du, si.dp_dv))
             per_area = dr.select(varying, textured, per_area)
 
@@ -495,8 +541,9 @@ def _density_on(shape):
 def _radiance_texture(emitter):
     """The texture of an area light: the only one among what hangs on it directly."""
     nodes = mi.traverse(emitter).hierarchy
-    return next(node for node, (_, depth) in nodes.items()
-                if depth == 1 and isinstance(node, mi.Texture))
+    return next(
+        node for node, (_, depth) in nodes.items() if depth == 1 and isinstance(node, mi.Texture)
+    )
 
 
 def _symmetric_height(p, q, twist):
@@ -515,8 +562,9 @@ def _relative(p, q, twist):
     return dx, dy, zeta, dr.maximum(0.25 * dr.square(twist) * dr.fma(dx, dx, dy * dy), 1e-12)
 
 
-def further_intervals(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, max_distance: mi.Float
-                      ) -> mi.Float:
+def further_intervals(
+    p: mi.Point3f, q: mi.Point3f, twist: mi.Float, max_distance: mi.Float
+) -> mi.Float:
     """How many of the intervals (mπ, (m+1)π), m ≥ 1, may hold half turns of geodesics to q.
 
     They are the first ones, as 2v + R² μ(v) = ζ has there, with v = mπ + x and c = cot x, the left
@@ -537,8 +585,9 @@ def further_intervals(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, max_distanc
     return dr.minimum(dr.floor(most / dr.pi), 2**24)
 
 
-def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float, second: mi.Bool
-                     ) -> tuple[mi.Bool, geometry.Connection]:
+def further_geodesic(
+    p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float, second: mi.Bool
+) -> tuple[mi.Bool, geometry.Connection]:
     """The first or ``second`` geodesic from p to q (cells) whose half turn is in (mπ, (m+1)π).
 
     Returns whether there is one, and it; its area density is signed. 2v + R² μ(v) is convex there,
@@ -571,8 +620,11 @@ def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float,
         return (2 * (low + x) - zeta) * dr.square(s) + R2 * (low + x - s * c)
 
     exists = (excess(x_min) < 0) & (r > 0)
-    x = bisect(dr.select(second, x_min, 0), dr.select(second, dr.pi, x_min),
-               lambda x: dr.select(second, excess(x) > 0, excess(x) < 0))
+    x = bisect(
+        dr.select(second, x_min, 0),
+        dr.select(second, dr.pi, x_min),
+        lambda x: dr.select(second, excess(x) > 0, excess(x) < 0),
+    )
     v = low + x
     horizontal = r * v / dr.sin(x)
     vertical = 2 * v / k
@@ -586,5 +638,8 @@ def further_geodesic(p: mi.Point3f, q: mi.Point3f, twist: mi.Float, m: mi.Float,
     s1, c1 = dr.sincos(angle + turn)
     w *= orientation * dr.sign(twist)
     return exists, geometry.Connection(
-        mi.Point3f(a * c0, a * s0, w), mi.Point3f(a * c1, a * s1, w), distance,
-        geometry.area_density(distance, w, twist))
+        mi.Point3f(a * c0, a * s0, w),
+        mi.Point3f(a * c1, a * s1, w),
+        distance,
+        geometry.area_density(distance, w, twist),
+    )

@@ -115,8 +115,9 @@ def require_gpu(variant: str) -> None:
 
     backend, _, rest = variant.partition("_")
     # Dr.Jit may look for a GPU only later: where there is a driver, it is left to judge for itself
-    if backend in GPUS and not (dr.has_backend(getattr(dr.JitBackend, GPUS[backend].name))
-                                or _has_driver(backend)):
+    if backend in GPUS and not (
+        dr.has_backend(getattr(dr.JitBackend, GPUS[backend].name)) or _has_driver(backend)
+    ):
         raise ImportError(
             f'the variant "{variant}" needs {GPUS[backend].needs}, and Dr.Jit finds none here: '
             f'use "llvm_{rest}", which needs none.'

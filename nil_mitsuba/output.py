@@ -37,11 +37,21 @@ class Output:
 
             image = denoise.denoise(image, *(picture.layers[name] for name in GUIDES))
             layers["noisy"] = picture.image[:, :, :3]
-        exr.write(self.exr, (picture.names, image), layers, metadata,
-                  component_format=picture.component_format, compression=self.compression)
+        exr.write(
+            self.exr,
+            (picture.names, image),
+            layers,
+            metadata,
+            component_format=picture.component_format,
+            compression=self.compression,
+        )
         if self.png:
-            png.write(self.png, png.linear_rgb(picture.names, image), exposure=self.exposure,
-                      filmic=self.filmic)
+            png.write(
+                self.png,
+                png.linear_rgb(picture.names, image),
+                exposure=self.exposure,
+                filmic=self.filmic,
+            )
 
 
 def metadata_of(state: Checkpoint) -> dict:

@@ -15,8 +15,16 @@ from .layers import RENDERED
 
 # In the order in which a picture's metadata tell them; "aovs" is not among those.
 NAMES = (
-    "twist", "quotient", "cell_origin", "cell_size", "tolerance", "max_distance",
-    "max_depth", "rr_depth", "hide_emitters", "aovs",
+    "twist",
+    "quotient",
+    "cell_origin",
+    "cell_size",
+    "tolerance",
+    "max_distance",
+    "max_depth",
+    "rr_depth",
+    "hide_emitters",
+    "aovs",
 )
 
 
@@ -63,8 +71,8 @@ def unknown(name: str) -> str:
     """One sentence on a property that "nil" does not have."""
     sentence = f'the integrator "nil" has no property "{name}"'
     near = nearest(name, NAMES)
-    return f'{sentence}: did you mean "{near}"?' if near else (
-        f"{sentence}, but {', '.join(NAMES)}."
+    return (
+        f'{sentence}: did you mean "{near}"?' if near else (f"{sentence}, but {', '.join(NAMES)}.")
     )
 
 
@@ -127,7 +135,8 @@ def _layers(given):
     for name in names:
         if name not in RENDERED:
             near = nearest(name, RENDERED)
-            raise RuntimeError(f'"aovs" names the layer "{name}", which is none of '
-                               f"{', '.join(RENDERED)}" + (f': did you mean "{near}"?'
-                                                           if near else ""))
+            raise RuntimeError(
+                f'"aovs" names the layer "{name}", which is none of '
+                f"{', '.join(RENDERED)}" + (f': did you mean "{near}"?' if near else "")
+            )
     return tuple(layer for layer in RENDERED if layer in names)

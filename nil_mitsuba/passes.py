@@ -52,8 +52,15 @@ class Passes:
     "independent" each sample has a seed of its own, so that it does not matter where they are cut.
     """
 
-    def __init__(self, integrator, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0,
-                 spp: int = 0, pass_spp: int | None = None):
+    def __init__(
+        self,
+        integrator,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+        pass_spp: int | None = None,
+    ):
         self.integrator = integrator
         self.scene = scene
         self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -70,18 +77,18 @@ class Passes:
         wanted = spp or self.sampler.sample_count()
         fits = max(1, WAVEFRONT_SAMPLES // pixels)
         if not self.own_seeds:
-            fits = min(fits, TILE_SAMPLES)           # A pixel's samples are in the same tile
+            fits = min(fits, TILE_SAMPLES)  # A pixel's samples are in the same tile
         if pass_spp is None:
             pass_spp = math.ceil(wanted / math.ceil(wanted / fits))
         self.sampler.set_sample_count(min(pass_spp, fits))
-        self.spp = self.sampler.sample_count()       # Some samplers round it up
+        self.spp = self.sampler.sample_count()  # Some samplers round it up
         self.sampler.set_samples_per_wavefront(self.spp)
         self.count = math.ceil(wanted / self.spp)
-        self.samples = pixels * self.spp             # Of a pass
+        self.samples = pixels * self.spp  # Of a pass
 
         pace = _paces.get(integrator)
         self.wavefront = samples_in_time(pace) if pace else FIRST_SAMPLES  # in the next one
-        self.begun, self.done = 0.0, 0               # When the pass in work began, and its samples
+        self.begun, self.done = 0.0, 0  # When the pass in work began, and its samples
         if not self.own_seeds:
             self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
             self.wavefront = math.ceil(pixels / self.tiles) * self.spp
@@ -120,8 +127,12 @@ class Passes:
             self._render_wavefronts(block, points, index)
             # Double precision only while they are added: a third of the memory
             values = block.tensor()
-            return Sums(mi.TensorXd(values), self._moments(values),
-                        mi.TensorXi(points, (crop.y, crop.x, depth)), ((index, index + 1),))
+            return Sums(
+                mi.TensorXd(values),
+                self._moments(values),
+                mi.TensorXi(points, (crop.y, crop.x, depth)),
+                ((index, index + 1),),
+            )
 
     def develop(self, sums: Sums) -> mi.TensorXf:
         """The image (height × width × channels) of what passes have added up to.
@@ -194,16 +205,20 @@ class Passes:
 
         def add(block, points):
             ADIntegrator._splat_to_block(
-                block, self.film, position,
+                block,
+                self.film,
+                position,
                 value=dr.select(inside, radiance * weight, 0),
                 weight=dr.select(inside, mi.Float(1), 0),
                 alpha=dr.select(valid & inside, mi.Float(1), 0),
-                aovs=self._channels(seen, "mean"), wavelengths=ray.wavelengths,
+                aovs=self._channels(seen, "mean"),
+                wavelengths=ray.wavelengths,
             )
             channels = self._channels(seen, "first")
             if channels:  # in one scatter: a second one would have the paths of the first traced
-                dr.scatter(points, mi.ArrayXi(channels), number,
-                           (number != NO_PIXEL) & (sample % spp == 0))
+                dr.scatter(
+                    points, mi.ArrayXi(channels), number, (number != NO_PIXEL) & (sample % spp == 0)
+                )
 
         return add, lanes
 
@@ -215,8 +230,13 @@ class Passes:
         if film.sample_border():
             place -= film.rfilter().border_size()
         # A pixel's own number in the crop; those of the border have none
-        own = inside & (place.x >= 0) & (place.y >= 0) & (place.x < film.crop_size().x) \
+        own = (
+            inside
+            & (place.x >= 0)
+            & (place.y >= 0)
+            & (place.x < film.crop_size().x)
             & (place.y < film.crop_size().y)
+        )
         number = dr.select(own, mi.UInt32(place.y * film.crop_size().x + place.x), NO_PIXEL)
 
         place += mi.Vector2i(film.crop_offset())
@@ -235,8 +255,12 @@ class Passes:
         return number, inside, ray, weight, position, on_film.x
 
     def _channels(self, seen, rule):
-        return [channel for layer in self.layers if LAYERS[layer].rule == rule
-                for channel in seen[layer]]
+        return [
+            channel
+            for layer in self.layers
+            if LAYERS[layer].rule == rule
+            for channel in seen[layer]
+        ]
 
 
 def samples_in_time(pace: float) -> int:

@@ -73,8 +73,9 @@ def exit_through_face(p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vecto
     return dr.maximum(nearest, 0), face
 
 
-def through_face(p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, face: mi.Vector3i,
-                 space: Space) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
+def through_face(
+    p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, face: mi.Vector3i, space: Space
+) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
     """Carry a point ``p`` on a face, ``others`` that belong to it and ``cell`` into the next cell.
 
     ``face`` is zero in lanes that stay. Crossing x = 0 or 1 shears z by k y, which can leave
@@ -89,9 +90,7 @@ def through_face(p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, fac
     )
     lift = dr.select(face.x == 0, 0, dr.floor(q.z))
     q.z -= lift
-    moved = [
-        mi.Point3f(o.x - fx, o.y - fy, dr.fma(-shear, o.y, o.z) - fz - lift) for o in others
-    ]
+    moved = [mi.Point3f(o.x - fx, o.y - fy, dr.fma(-shear, o.y, o.z) - fz - lift) for o in others]
     g = mi.Vector3i(
         cell.x + face.x,
         cell.y + face.y,

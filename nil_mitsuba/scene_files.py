@@ -55,7 +55,7 @@ class SceneFiles:
         # Mitsuba writes the number as a constant of its own
         text = re.sub(r'\s*<default name="spp"[^>]*>', "", text)
         digest = hashlib.sha256(text.encode())
-        for path in self.files[len(self.rest.files):]:
+        for path in self.files[len(self.rest.files) :]:
             digest.update(hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 

@@ -20,8 +20,9 @@ FAR = 1e15  # scene units; squares of the distances between larger numbers overf
 # own coordinates.
 ROUNDINGS = 32
 SPHERE = int(mi.ShapeType.Sphere)
-PRECISE = (mi.ShapeType.Mesh | mi.ShapeType.Rectangle | mi.ShapeType.Disk | mi.ShapeType.Cylinder
-           | SPHERE)
+PRECISE = (
+    mi.ShapeType.Mesh | mi.ShapeType.Rectangle | mi.ShapeType.Disk | mi.ShapeType.Cylinder | SPHERE
+)
 # Straight curves need no more than 32 either, but for linear ones as thin as 1e-4 of where they
 # lie. Of bent ones, and of grids and ellipsoids, little is known.
 OTHER_ROUNDINGS = 1500
@@ -55,8 +56,10 @@ class Shapes:
         self.shapes = scene.shapes()
         # All are on their way before the first is waited for
         meshes = {i: _Triangles(shape) for i, shape in enumerate(self.shapes) if shape.is_mesh()}
-        self.extents = [meshes[i].extent() if i in meshes else _extent(shape)
-                        for i, shape in enumerate(self.shapes)]
+        self.extents = [
+            meshes[i].extent() if i in meshes else _extent(shape)
+            for i, shape in enumerate(self.shapes)
+        ]
         self.box = mi.ScalarBoundingBox3f()
         for extent in self.extents:
             self.box.expand(extent.box)
@@ -76,8 +79,11 @@ class Shapes:
         pointers = list(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
         places = [0] * (max(pointers, default=0) + 1)
         others = [i for i in range(len(self.shapes)) if i not in meshes]
-        largest = [mi.Float([_largest(self.shapes[i], self.extents[i].box) for i in others])] \
-            if others else []
+        largest = (
+            [mi.Float([_largest(self.shapes[i], self.extents[i].box) for i in others])]
+            if others
+            else []
+        )
         for place, i in enumerate(others):
             places[pointers[i]] = place << 1
         place = len(others)
@@ -88,8 +94,9 @@ class Shapes:
         self.places = opaque(mi.UInt32(places))
         self.largest = opaque(dr.concat(largest) if largest else mi.Float(0))
         if self.has_instances:
-            self.shrinkage = opaque(mi.Float([_shrinkage(self.shapes[i]) if instances[i] else 0
-                                              for i in others]))
+            self.shrinkage = opaque(
+                mi.Float([_shrinkage(self.shapes[i]) if instances[i] else 0 for i in others])
+            )
 
     def margin(self, si: mi.SurfaceInteraction3f, length: mi.Float) -> mi.Float:
         """How far (scene units) from a hit a ray has to start, not to meet the surface again.
@@ -119,8 +126,7 @@ class Shapes:
             radius = dr.norm(si.dp_dv) * dr.inv_pi
             shrinkage = dr.gather(mi.Float, self.shrinkage, index, valid & instanced)
             shrunk = dr.minimum(ROUNDINGS * ROUNDING * shrinkage, MOST_OF_RADIUS) * radius
-            margin = dr.select(instanced & (kind == SPHERE),
-                               dr.maximum(margin, shrunk), margin)
+            margin = dr.select(instanced & (kind == SPHERE), dr.maximum(margin, shrunk), margin)
         return margin
 
 
@@ -196,8 +202,10 @@ class _Triangles:
         positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
         self.count = mesh.face_count()
         triangle = dr.arange(mi.UInt32, self.count)
-        a, b, c = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
-                   for i in range(3))
+        a, b, c = (
+            dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
+            for i in range(3)
+        )
         finite = dr.all((dr.abs(a) < FAR) & (dr.abs(b) < FAR) & (dr.abs(c) < FAR))
         low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         self.largest = dr.max(dr.maximum(dr.abs(low), dr.abs(high)))
@@ -211,5 +219,9 @@ class _Triangles:
         if self.whole[0]:
             box = mi.ScalarBoundingBox3f([x[0] for x in self.low], [x[0] for x in self.high])
         lost = self.count - self.whole[0]
-        return Extent(box, f"{lost} of its {self.count} triangles have corners that are no numbers "
-                           "up to 1e15" if lost else "")
+        return Extent(
+            box,
+            f"{lost} of its {self.count} triangles have corners that are no numbers up to 1e15"
+            if lost
+            else "",
+        )

@@ -58,8 +58,12 @@ class Rules:
         return progress.passes > 0 and (
             (self.spp is not None and progress.samples >= self.spp)
             or (self.seconds is not None and progress.seconds >= self.seconds)
-            or (self.noise is not None and progress.noise is not None
-                and progress.passes >= NOISE_PASSES and progress.noise <= self.noise)
+            or (
+                self.noise is not None
+                and progress.noise is not None
+                and progress.passes >= NOISE_PASSES
+                and progress.noise <= self.noise
+            )
         )
 
 
@@ -105,15 +109,24 @@ class Still:
     if the integrator is not "nil" itself, which renders passes.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: int | mi.Sensor = 0,
-                 integrator: mi.Integrator | None = None, seed: int = 0, rules: Rules = Rules(),
-                 pass_spp: int | None = None, scene_hash: str | None = None):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        integrator: mi.Integrator | None = None,
+        seed: int = 0,
+        rules: Rules = Rules(),
+        pass_spp: int | None = None,
+        scene_hash: str | None = None,
+    ):
         from .passes import Passes  # of the current variant
 
         integrator = integrator or scene.integrator()
         if integrator is None:
-            raise ValueError('the scene has no integrator: give it one of the type "nil", or pass '
-                             'integrator=mi.load_dict({"type": "nil"}).')
+            raise ValueError(
+                'the scene has no integrator: give it one of the type "nil", or pass '
+                'integrator=mi.load_dict({"type": "nil"}).'
+            )
         if not hasattr(integrator, "view"):
             raise ValueError(
                 f'the integrator "{type(integrator).__name__}" renders in one go: only "nil" '
@@ -139,8 +152,11 @@ class Still:
             "sampler": self.passes.sampler.class_name(),
             "film": film_settings(self.film),
             "layers": list(integrator.layers),
-            "integrator": {name: _plain(getattr(integrator, name)) for name in parameters.NAMES
-                           if name != "aovs"},
+            "integrator": {
+                name: _plain(getattr(integrator, name))
+                for name in parameters.NAMES
+                if name != "aovs"
+            },
             "variant": mi.variant(),
             "versions": versions(),
         }
@@ -190,9 +206,13 @@ class Still:
                 index += 1
             index = max(index, end)
 
-    def accumulate(self, state: Checkpoint, parts: Iterable[Checkpoint],
-                   progress: Callable[[Progress], None] | None = None,
-                   saver: Saver | None = None) -> tuple[Checkpoint, int | None]:
+    def accumulate(
+        self,
+        state: Checkpoint,
+        parts: Iterable[Checkpoint],
+        progress: Callable[[Progress], None] | None = None,
+        saver: Saver | None = None,
+    ) -> tuple[Checkpoint, int | None]:
         """Add parts until there are no more, a rule is met, or a signal comes.
 
         ``parts`` yields checkpoints of passes as they are rendered, by whomever. Returns the sums
@@ -204,8 +224,13 @@ class Still:
         with interruption() as signals:
             while True:
                 state.seconds = before + time.perf_counter() - start
-                report = Progress(state.sums.count, state.sums.count * self.passes.spp,
-                                  state.seconds, noise(self.film, state.sums), self.rules)
+                report = Progress(
+                    state.sums.count,
+                    state.sums.count * self.passes.spp,
+                    state.seconds,
+                    noise(self.film, state.sums),
+                    self.rules,
+                )
                 try:
                     if progress is not None:
                         progress(report)
@@ -242,7 +267,7 @@ class Saver:
         self.complain = complain
         self.complained = False
         self.saved = self.passed = time.perf_counter()  # State of the last checkpoint, last pass
-        self.pass_seconds = self.write_seconds = 0.0    # The longest so far
+        self.pass_seconds = self.write_seconds = 0.0  # The longest so far
 
     def after_pass(self, state: Checkpoint) -> None:
         """Save, if the checkpoint were too old after one more pass."""
@@ -328,8 +353,10 @@ def noise(film: mi.Film, sums: Sums) -> float | None:
     """
     total, weight = luminance(film, sums.values)
     pixels = len(weight)
-    ss, sw, ww = (dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels)
-                            + i * pixels) for i in range(3))
+    ss, sw, ww = (
+        dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels) + i * pixels)
+        for i in range(3)
+    )
     n = dr.opaque(mi.Float64, sums.count)
     finite = dr.isfinite(total) & dr.isfinite(ss) & dr.isfinite(weight)
     seen = (weight > 0) & finite
@@ -422,13 +449,13 @@ def picture_of(state: Checkpoint, film: mi.Film | None = None) -> Picture:
     names = list(settings["film"]["pixel_format"].upper())
     if not names:  # a film with channels of its own
         total = len(channel_names(layers))
-        names = [field.name for field in film.bitmap().struct_()][:image.shape[2] - total]
+        names = [field.name for field in film.bitmap().struct_()][: image.shape[2] - total]
     planes, at = {}, len(names)
     for layer in layers:
         end = at + len(LAYERS[layer].channels)
         planes[layer] = image[:, :, at:end]
         at = end
-    return Picture(names, image[:, :, :len(names)], planes, settings["film"]["component_format"])
+    return Picture(names, image[:, :, : len(names)], planes, settings["film"]["component_format"])
 
 
 def component_format(film: mi.Film) -> str:
@@ -458,17 +485,19 @@ def film_of(settings: dict) -> mi.Film:
     """A film that develops what one with these settings has summed up; raises ValueError."""
     if settings["type"] != "HDRFilm":
         raise ValueError(f'parts of the film "{settings["type"]}" cannot be merged: use hdrfilm.')
-    return mi.load_dict({
-        "type": "hdrfilm",
-        "width": settings["size"][0],
-        "height": settings["size"][1],
-        "crop_width": settings["crop_size"][0],
-        "crop_height": settings["crop_size"][1],
-        "crop_offset_x": settings["crop_offset"][0],
-        "crop_offset_y": settings["crop_offset"][1],
-        "pixel_format": PIXEL_FORMATS.get(settings["pixel_format"], settings["pixel_format"]),
-        "component_format": settings["component_format"],
-    })
+    return mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": settings["size"][0],
+            "height": settings["size"][1],
+            "crop_width": settings["crop_size"][0],
+            "crop_height": settings["crop_size"][1],
+            "crop_offset_x": settings["crop_offset"][0],
+            "crop_offset_y": settings["crop_offset"][1],
+            "pixel_format": PIXEL_FORMATS.get(settings["pixel_format"], settings["pixel_format"]),
+            "component_format": settings["component_format"],
+        }
+    )
 
 
 def hash_of(thing: mi.Scene | mi.Sensor) -> str:
@@ -476,8 +505,9 @@ def hash_of(thing: mi.Scene | mi.Sensor) -> str:
 
     Numbers of samples are no part of it: each render in between sets them.
     """
-    text = re.sub(r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+", "",
-                  str(thing))
+    text = re.sub(
+        r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing)
+    )
     digest = hashlib.sha256(text.encode())
     traversed = mi.traverse(thing)
     for key in sorted(traversed.keys()):

@@ -40,8 +40,11 @@ class Sums:
         Raises ValueError if a pass is in both.
         """
         passes = joined(self.passes, other.passes)
-        first = min((sums for sums in (self, other) if sums.passes), default=self,
-                    key=lambda sums: sums.passes[0])
+        first = min(
+            (sums for sums in (self, other) if sums.passes),
+            default=self,
+            key=lambda sums: sums.passes[0],
+        )
         sums = Sums(self.values + other.values, self.moments + other.moments, first.points, passes)
         dr.eval(sums.values, sums.moments)
         return sums

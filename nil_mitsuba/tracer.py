@@ -150,8 +150,9 @@ class Chords:
 class Tracer:
     """Follows geodesics through a scene, in plain Nil or in the quotient."""
 
-    def __init__(self, scene: mi.Scene, space: Space, max_distance: float,
-                 shapes: Shapes | None = None):
+    def __init__(
+        self, scene: mi.Scene, space: Space, max_distance: float, shapes: Shapes | None = None
+    ):
         self.scene = scene
         self.space = space
         self.max_distance = dr.opaque(mi.Float, max_distance)
@@ -190,9 +191,19 @@ class Tracer:
         return dr.minimum(1.001 * bound + 1e-3, limit)
 
     @dr.syntax
-    def _approach(self, p: mi.Point3f, v: mi.Vector3f, chords: Chords, stretch: mi.Float,
-                  vertex: mi.Point3f, base: mi.Point3f, direction: mi.Vector3f, t: mi.Float,
-                  reach: mi.Float, active: mi.Bool):
+    def _approach(
+        self,
+        p: mi.Point3f,
+        v: mi.Vector3f,
+        chords: Chords,
+        stretch: mi.Float,
+        vertex: mi.Point3f,
+        base: mi.Point3f,
+        direction: mi.Vector3f,
+        t: mi.Float,
+        reach: mi.Float,
+        active: mi.Bool,
+    ):
         """Pass what is empty before the scene's boxes, if ``vertex`` (at arc length t) is outside.
 
         Returns the vertex, the geodesic's point and direction there and their arc length (cells),
@@ -230,8 +241,9 @@ class Tracer:
         y = turn * v.x
         return mi.Vector3f(-turn * v.y, y, dr.fma(k * p.x, y, k * v.x * v.y))
 
-    def piece(self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float
-              ) -> Piece:
+    def piece(
+        self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float
+    ) -> Piece:
         """What of the chord from ``vertex`` (at arc length t0) to ``end`` lies in this cell.
 
         ``direction`` is taken for that of a chord without length.
@@ -255,8 +267,15 @@ class Tracer:
     # ------------------------------------------------------------------ tracing
 
     @dr.syntax
-    def intersect(self, p: mi.Point3f, v: mi.Vector3f, cone: Cone, reach: mi.Float,
-                  active: mi.Bool, time: mi.Float = 0) -> Hit:
+    def intersect(
+        self,
+        p: mi.Point3f,
+        v: mi.Vector3f,
+        cone: Cone,
+        reach: mi.Float,
+        active: mi.Bool,
+        time: mi.Float = 0,
+    ) -> Hit:
         """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` within ``reach``.
 
         In the quotient ``p`` lies in the unit cube. A hit lies off the geodesic by at most 1e-5
@@ -268,8 +287,13 @@ class Tracer:
         quotient = space.quotient
         turn = k * v.z
         bend = Bend(v, k)
-        chords = Chords(bend, cone, dr.select(cone.soft, SOFT_SAGITTA, SAGITTA),
-                        dr.select(cone.soft, 0, START), self.least)
+        chords = Chords(
+            bend,
+            cone,
+            dr.select(cone.soft, SOFT_SAGITTA, SAGITTA),
+            dr.select(cone.soft, 0, START),
+            self.least,
+        )
         # Where chords join differs from ray to ray: edges are off by noise, not by steps.
         stretch = dr.select(cone.soft, 1, dr.fma(2 / 3, random_of(p, v), 2 / 3))
 
@@ -298,8 +322,17 @@ class Tracer:
                 fresh = redo | (t0 >= t1)
                 if not quotient:
                     vertex, base, direction, t0 = self._approach(
-                        p, v, chords, stretch, vertex, base, direction, t0, reach,
-                        searching & fresh & ~redo)
+                        p,
+                        v,
+                        chords,
+                        stretch,
+                        vertex,
+                        base,
+                        direction,
+                        t0,
+                        reach,
+                        searching & fresh & ~redo,
+                    )
                     t1 = dr.select(redo, t1, t0)
                 # At least a few roundings of the length, so that every chord moves on
                 h = dr.minimum(stretch * chords.after(t0), dr.minimum(cap, bend.longest))
@@ -310,7 +343,8 @@ class Tracer:
                 base, direction = geometry.short_flow(base, v, t1, ahead, k)
                 t1 = dr.select(fresh, t0 + h, t1)
                 end = dr.select(
-                    fresh, dr.fma(self._lift(h), self.acceleration(base, direction), base), end)
+                    fresh, dr.fma(self._lift(h), self.acceleration(base, direction), base), end
+                )
                 scale = dr.select(fresh, dr.maximum(h, length), scale)
                 length = dr.select(fresh, h, length)
                 cap = dr.select(fresh & ~redo, 2 * cap, cap)
@@ -319,14 +353,16 @@ class Tracer:
                 piece = self.piece(vertex, end, direction, t0)
                 last = dr.fma(piece.part, piece.length, piece.before + space.slack)
                 ray = line_ray(piece.o, piece.d, time, last * space.size)
-                found = scene.ray_intersect_preliminary(ray, coherent=False,
-                                                        active=searching & (t0 < reach))
+                found = scene.ray_intersect_preliminary(
+                    ray, coherent=False, active=searching & (t0 < reach)
+                )
                 there = found.is_valid()
                 through = ~there & piece.leaves
                 # Where something was met, the chord stays as it is
                 t0 = dr.select(there, t0, dr.select(through, dr.fma(piece.part, t1 - t0, t0), t1))
-                vertex = dr.select(there, vertex, dr.select(
-                    through, dr.fma(piece.along, piece.part, vertex), end))
+                vertex = dr.select(
+                    there, vertex, dr.select(through, dr.fma(piece.along, piece.part, vertex), end)
+                )
                 if quotient:
                     face = dr.select(through, piece.face, 0)
                     vertex, (end, base), cell = through_face(vertex, [end, base], cell, face, space)
@@ -374,8 +410,12 @@ class Tracer:
                 # Nothing before the ray's own start, which may be close by its surface
                 before = dr.minimum(space.slack, (at + s_first) * speed)
                 start = space.to_scene(dr.fma(along, s_first, point) - before * line)
-                ray = line_ray(start, line, time, dr.fma(s_last - s_first, speed,
-                                                         before + space.slack) * space.size)
+                ray = line_ray(
+                    start,
+                    line,
+                    time,
+                    dr.fma(s_last - s_first, speed, before + space.slack) * space.size,
+                )
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=looking)
                 # A tangent that meets a surface from the other side than the chord did has found
                 # where the geodesic comes back, or what lies behind its start.
@@ -389,8 +429,11 @@ class Tracer:
                 window = dr.minimum(0.5 * window, 256 * error)
                 valid |= good
                 distance = dr.select(good, at, distance)
-                o, d, found = dr.select(good, start, o), dr.select(good, line, d), \
-                    dr.select(good, pi, found)
+                o, d, found = (
+                    dr.select(good, start, o),
+                    dr.select(good, line, d),
+                    dr.select(good, pi, found),
+                )
                 looking &= ~good
 
             redo = there & ~valid
@@ -399,12 +442,21 @@ class Tracer:
             active = mi.Bool(redo)
 
         arrival = geometry.turned(v, turn * dr.select(valid, distance, 0))
-        return Hit(valid, dr.select(valid, distance, dr.inf), arrival, cell, line_ray(o, d, time),
-                   found)
+        return Hit(
+            valid, dr.select(valid, distance, dr.inf), arrival, cell, line_ray(o, d, time), found
+        )
 
     @dr.syntax
-    def occluded(self, p: mi.Point3f, start: mi.Point3f, v: mi.Vector3f, cone: Cone,
-                 reach: mi.Float, active: mi.Bool, time: mi.Float = 0) -> mi.Bool:
+    def occluded(
+        self,
+        p: mi.Point3f,
+        start: mi.Point3f,
+        v: mi.Vector3f,
+        cone: Cone,
+        reach: mi.Float,
+        active: mi.Bool,
+        time: mi.Float = 0,
+    ) -> mi.Bool:
         """Whether anything stands in the way of the geodesic from ``p`` within ``reach`` (cells).
 
         The first chord begins at ``start``: off the surface on which ``p`` lies, while the last one
@@ -425,7 +477,8 @@ class Tracer:
             fresh = t0 >= t1
             if not quotient:
                 vertex, base, direction, t0 = self._approach(
-                    p, v, chords, mi.Float(1), vertex, base, direction, t0, reach, active & fresh)
+                    p, v, chords, mi.Float(1), vertex, base, direction, t0, reach, active & fresh
+                )
                 t1 = mi.Float(t0)
             h = dr.maximum(chords.between(t0, reach - t0), 2**-21 * t0)
             last = h >= reach - t0
@@ -435,15 +488,20 @@ class Tracer:
             # Corners off the curve: secants would meet what is on its inner side, and only that.
             # Two chords whose ends stay on it are right on average with 4/3 of the sagitta. Near
             # the light they keep to the curve, not to reach behind it.
-            lift = dr.minimum((4 / 3) * 0.125 * dr.square(h),
-                              0.2 * chords.room(reach - t1) / bend.across)
+            lift = dr.minimum(
+                (4 / 3) * 0.125 * dr.square(h), 0.2 * chords.room(reach - t1) / bend.across
+            )
             corner = dr.fma(dr.select(last, 0, -lift), self.acceleration(base, direction), base)
             end = dr.select(fresh, corner, end)
 
             piece = self.piece(vertex, end, direction, t0)
             after = dr.select(piece.leaves | ~last, space.slack, 0)
-            ray = line_ray(piece.o, piece.d, time, space.size * dr.fma(
-                piece.part, piece.length, piece.before + after))
+            ray = line_ray(
+                piece.o,
+                piece.d,
+                time,
+                space.size * dr.fma(piece.part, piece.length, piece.before + after),
+            )
             hit = scene.ray_test(ray, coherent=False, active=active & (t0 < reach))
 
             blocked |= hit
@@ -451,7 +509,8 @@ class Tracer:
             vertex = dr.select(piece.leaves, dr.fma(piece.along, piece.part, vertex), end)
             if quotient:
                 face = dr.select(piece.leaves, piece.face, 0)
-                vertex, (end, base), _ = through_face(vertex, [end, base], mi.Vector3i(0), face,
-                                                      space)
+                vertex, (end, base), _ = through_face(
+                    vertex, [end, base], mi.Vector3i(0), face, space
+                )
             active &= ~hit & (t0 < reach)
         return blocked

@@ -89,9 +89,15 @@ def torus_knot(name, p=2, q=3, around=30, along=900):
 #  Meshes in plain Python: lists of points and of triangles
 # ---------------------------------------------------------------------------
 
+
 def write_mesh(name, points, faces, normals=None, uv=None):
-    mesh = mi.Mesh(name, len(points), len(faces), has_vertex_normals=normals is not None,
-                   has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh(
+        name,
+        len(points),
+        len(faces),
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=uv is not None,
+    )
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float([c for point in points for c in point])
     params["faces"] = mi.UInt32([i for face in faces for i in face])
@@ -134,11 +140,17 @@ def spline(knots, steps):
     for i in range(len(knots) - 1):
         a, b, c, d = (knots[min(max(i + n, 0), len(knots) - 1)] for n in (-1, 0, 1, 2))
         for t in (step / steps for step in range(steps)):
-            curve.append(tuple(
-                0.5 * (2 * q + t * (r - p + t * (2 * p - 5 * q + 4 * r - s
-                                                 + t * (3 * q - p - 3 * r + s))))
-                for p, q, r, s in zip(a, b, c, d)
-            ))
+            curve.append(
+                tuple(
+                    0.5
+                    * (
+                        2 * q
+                        + t
+                        * (r - p + t * (2 * p - 5 * q + 4 * r - s + t * (3 * q - p - 3 * r + s)))
+                    )
+                    for p, q, r, s in zip(a, b, c, d)
+                )
+            )
     return [*curve, knots[-1]]
 
 
@@ -156,27 +168,59 @@ def chessmen():
     """Write four chessmen for a board whose squares have edge 1."""
     bottom = [(0, 0), (0.36, 0)]
     foot = [(0.36, 0), (0.40, 0.03), (0.38, 0.09), (0.31, 0.13), (0.27, 0.17)]
-    turned("pawn.ply", bottom, [*foot, (0.17, 0.27), (0.12, 0.42), (0.11, 0.56)],
-           [(0.11, 0.56), (0.20, 0.585), (0.20, 0.61), (0.09, 0.64)],
-           [(0.09, 0.64), (0.19, 0.72), (0.215, 0.82), (0.17, 0.93), (0.07, 1.0), (0, 1.015)])
-    turned("king.ply", bottom, [*foot, (0.19, 0.30), (0.14, 0.6), (0.13, 1.0), (0.15, 1.12)],
-           [(0.15, 1.12), (0.25, 1.15), (0.25, 1.18), (0.15, 1.22)],
-           [(0.15, 1.22), (0.17, 1.3), (0.235, 1.55), (0.24, 1.6)],
-           [(0.24, 1.6), (0.2, 1.66), (0.08, 1.71), (0.04, 1.75)],
-           [(0.04, 1.75), (0.085, 1.8), (0.085, 1.86), (0.03, 1.91), (0, 1.915)])
-    turned("bishop.ply", bottom, [*foot, (0.18, 0.28), (0.125, 0.55), (0.115, 0.85)],
-           [(0.115, 0.85), (0.215, 0.88), (0.215, 0.91), (0.10, 0.94)],
-           [(0.10, 0.94), (0.18, 1.03), (0.19, 1.13), (0.13, 1.28), (0.05, 1.38)],
-           [(0.05, 1.38), (0.07, 1.42), (0.05, 1.46), (0, 1.475)])
-    turned("rook.ply", bottom, [*foot, (0.21, 0.25), (0.175, 0.5), (0.18, 0.74), (0.2, 0.78)],
-           [(0.2, 0.78), (0.27, 0.80)], [(0.27, 0.80), (0.27, 0.99)], [(0.27, 0.99), (0.19, 0.99)],
-           [(0.19, 0.99), (0.19, 0.88)], [(0.19, 0.88), (0, 0.88)])
+    turned(
+        "pawn.ply",
+        bottom,
+        [*foot, (0.17, 0.27), (0.12, 0.42), (0.11, 0.56)],
+        [(0.11, 0.56), (0.20, 0.585), (0.20, 0.61), (0.09, 0.64)],
+        [(0.09, 0.64), (0.19, 0.72), (0.215, 0.82), (0.17, 0.93), (0.07, 1.0), (0, 1.015)],
+    )
+    turned(
+        "king.ply",
+        bottom,
+        [*foot, (0.19, 0.30), (0.14, 0.6), (0.13, 1.0), (0.15, 1.12)],
+        [(0.15, 1.12), (0.25, 1.15), (0.25, 1.18), (0.15, 1.22)],
+        [(0.15, 1.22), (0.17, 1.3), (0.235, 1.55), (0.24, 1.6)],
+        [(0.24, 1.6), (0.2, 1.66), (0.08, 1.71), (0.04, 1.75)],
+        [(0.04, 1.75), (0.085, 1.8), (0.085, 1.86), (0.03, 1.91), (0, 1.915)],
+    )
+    turned(
+        "bishop.ply",
+        bottom,
+        [*foot, (0.18, 0.28), (0.125, 0.55), (0.115, 0.85)],
+        [(0.115, 0.85), (0.215, 0.88), (0.215, 0.91), (0.10, 0.94)],
+        [(0.10, 0.94), (0.18, 1.03), (0.19, 1.13), (0.13, 1.28), (0.05, 1.38)],
+        [(0.05, 1.38), (0.07, 1.42), (0.05, 1.46), (0, 1.475)],
+    )
+    turned(
+        "rook.ply",
+        bottom,
+        [*foot, (0.21, 0.25), (0.175, 0.5), (0.18, 0.74), (0.2, 0.78)],
+        [(0.2, 0.78), (0.27, 0.80)],
+        [(0.27, 0.80), (0.27, 0.99)],
+        [(0.27, 0.99), (0.19, 0.99)],
+        [(0.19, 0.99), (0.19, 0.88)],
+        [(0.19, 0.88), (0, 0.88)],
+    )
 
 
 def vase():
-    turned("vase.ply", [(0, 0), (0.2, 0)],
-           [(0.2, 0), (0.34, 0.15), (0.42, 0.4), (0.33, 0.68), (0.14, 0.88), (0.11, 1.0),
-            (0.17, 1.1), (0.16, 1.105), (0.095, 1.0), (0.1, 0.9)])
+    turned(
+        "vase.ply",
+        [(0, 0), (0.2, 0)],
+        [
+            (0.2, 0),
+            (0.34, 0.15),
+            (0.42, 0.4),
+            (0.33, 0.68),
+            (0.14, 0.88),
+            (0.11, 1.0),
+            (0.17, 1.1),
+            (0.16, 1.105),
+            (0.095, 1.0),
+            (0.1, 0.9),
+        ],
+    )
 
 
 def shell(name, turns=5, along=500, around=28):
@@ -203,14 +247,26 @@ def arches(name, count=14):
     # Points (x, z) of the left half with their outward normals.
     half = [((-1, 0), (-1, 0)), ((-1, springing), (-1, 0))]
     for a in (apex * i / steps for i in range(1, steps)):
-        half.append(((centre - radius * math.cos(a), springing + radius * math.sin(a)),
-                     (-math.cos(a), math.sin(a))))
+        half.append(
+            (
+                (centre - radius * math.cos(a), springing + radius * math.sin(a)),
+                (-math.cos(a), math.sin(a)),
+            )
+        )
     # The two halves meet in a mitre.
     top = [((0, springing + radius * math.sin(apex)), (0, 1 / math.sin(apex)))]
     line = half + top + [((-x, z), (-nx, nz)) for (x, z), (nx, nz) in half[::-1]]
     w, c = 0.10, 0.045  # half width of a rib, and how much of its edges is cut off
-    section = [(w, c - w), (w - c, -w), (c - w, -w), (-w, c - w),
-               (-w, w - c), (c - w, w), (w - c, w), (w, w - c)]
+    section = [
+        (w, c - w),
+        (w - c, -w),
+        (c - w, -w),
+        (-w, c - w),
+        (-w, w - c),
+        (c - w, w),
+        (w - c, w),
+        (w, w - c),
+    ]
 
     def block(x, y, z0, z1, w):
         square = [(x - w, y - w), (x + w, y - w), (x + w, y + w), (x - w, y + w)]
@@ -219,8 +275,11 @@ def arches(name, count=14):
 
     parts = []
     for y in range(count):
-        parts.append(tube([[(x + nx * a, y + b, z + nz * a) for a, b in section]
-                           for (x, z), (nx, nz) in line]))
+        parts.append(
+            tube(
+                [[(x + nx * a, y + b, z + nz * a) for a, b in section] for (x, z), (nx, nz) in line]
+            )
+        )
         for x in (-1, 1):
             parts += [block(x, y, 0, 0.18, 0.17), block(x, y, 1.5, 1.62, 0.16)]
     write_mesh(name, *join(parts))
@@ -231,8 +290,13 @@ def ball(centre, radius, level, rough=0.0, rng=None, flat=1.0):
     g = (1 + math.sqrt(5)) / 2
     points = [(0, s, t * g) for s in (-1, 1) for t in (-1, 1)]
     points = [(p[-i], p[1 - i], p[2 - i]) for i in range(3) for p in points]
-    faces = [(a, b, c) for a in range(12) for b in range(a) for c in range(b)
-             if all(math.dist(points[i], points[j]) < 2.1 for i, j in ((a, b), (b, c), (c, a)))]
+    faces = [
+        (a, b, c)
+        for a in range(12)
+        for b in range(a)
+        for c in range(b)
+        if all(math.dist(points[i], points[j]) < 2.1 for i, j in ((a, b), (b, c), (c, a)))
+    ]
     for _ in range(level):
         middles, finer = {}, []
 
@@ -268,8 +332,14 @@ def island():
         return amount * rng.uniform(-1, 1)
 
     around, rock = 26, []
-    for radius, z in ((0.0, -0.62), (0.16, -0.5), (0.34, -0.34), (0.62, -0.2), (0.9, -0.1),
-                      (1.0, -0.02)):
+    for radius, z in (
+        (0.0, -0.62),
+        (0.16, -0.5),
+        (0.34, -0.34),
+        (0.62, -0.2),
+        (0.9, -0.1),
+        (1.0, -0.02),
+    ):
         ring = []
         for i in range(around):
             a = 2 * math.pi * (i + 0.5 * rng.random()) / around
@@ -284,8 +354,13 @@ def island():
     write_mesh("grass.ply", *tube(grass))
 
     turned("trunk.ply", [(0.13, 0.05), (0.075, 0.2), (0.055, 0.45), (0.07, 0.75)], around=12)
-    crown = [((0.05, 0, 0.95), 0.36), ((-0.22, 0.1, 0.78), 0.26), ((0.25, -0.12, 0.75), 0.27),
-             ((0.02, 0.25, 0.72), 0.24), ((0, -0.2, 0.7), 0.22)]
+    crown = [
+        ((0.05, 0, 0.95), 0.36),
+        ((-0.22, 0.1, 0.78), 0.26),
+        ((0.25, -0.12, 0.75), 0.27),
+        ((0.02, 0.25, 0.72), 0.24),
+        ((0, -0.2, 0.7), 0.22),
+    ]
     write_mesh("leaves.ply", *join(ball(c, r, 2, 0.09, rng, 0.85) for c, r in crown))
 
 
@@ -295,8 +370,10 @@ def lamps():
     for i in range(-5, 6):
         for j in range(11):
             x, y = 1.3 * i, 1.3 * j
-            posts += [tube([circle(r, z, 8, x, y) for z in (0, height)])
-                      for r, height in ((0.022, 0.93), (0.05, 0.1))]
+            posts += [
+                tube([circle(r, z, 8, x, y) for z in (0, height)])
+                for r, height in ((0.022, 0.93), (0.05, 0.1))
+            ]
             (cold if (7 * i + 3 * j) % 5 == 4 else warm).append(ball((x, y, 1), 0.085, 2))
     for name, parts in (("posts", posts), ("lamps-warm", warm), ("lamps-cold", cold)):
         write_mesh(f"{name}.ply", *join(parts))
@@ -352,13 +429,16 @@ def winding_floor(name, size=56):
                     polygon = [(x, y, z - round(z - level) + floor, *n) for x, y, z, *n in triangle]
                     polygon = clip(clip(polygon, 1, margin), -1, 1 - margin)
                     # Neighbours agree on a vertex but for rounding.
-                    ids = [index.setdefault(tuple(round(c, 6) for c in p), len(index))
-                           for p in polygon]
-                    faces += [(ids[0], m, n) for m, n in zip(ids[1:], ids[2:])
-                              if len({ids[0], m, n}) == 3]
+                    ids = [
+                        index.setdefault(tuple(round(c, 6) for c in p), len(index)) for p in polygon
+                    ]
+                    faces += [
+                        (ids[0], m, n) for m, n in zip(ids[1:], ids[2:]) if len({ids[0], m, n}) == 3
+                    ]
     vertices = list(index)
-    write_mesh(name, [v[:3] for v in vertices], faces, [v[3:] for v in vertices],
-               [v[:2] for v in vertices])
+    write_mesh(
+        name, [v[:3] for v in vertices], faces, [v[3:] for v in vertices], [v[:2] for v in vertices]
+    )
 
 
 if __name__ == "__main__":
@@ -373,16 +453,22 @@ if __name__ == "__main__":
     winding_floor("winding-floor.ply")
     sky(
         "evening.exr",
-        zenith=(0.10, 0.26, 0.60), horizon=(0.95, 0.50, 0.34), nadir=(0.10, 0.08, 0.22),
+        zenith=(0.10, 0.26, 0.60),
+        horizon=(0.95, 0.50, 0.34),
+        nadir=(0.10, 0.08, 0.22),
         glows=[((9.0, 5.4, 2.6), (0.5, -0.45, 0.75), 14), ((0.4, 0.7, 1.2), (-0.8, -0.3, 0.25), 4)],
     )
     sky(
         "day.exr",
-        zenith=(0.45, 0.62, 0.95), horizon=(0.86, 0.88, 0.90), nadir=(0.30, 0.28, 0.27),
+        zenith=(0.45, 0.62, 0.95),
+        horizon=(0.86, 0.88, 0.90),
+        nadir=(0.30, 0.28, 0.27),
         glows=[((7.0, 6.3, 5.2), (-0.3, -0.6, 0.75), 10)],
     )
     sky(
         "night.exr",
-        zenith=(0.02, 0.06, 0.16), horizon=(0.10, 0.34, 0.42), nadir=(0.03, 0.02, 0.08),
+        zenith=(0.02, 0.06, 0.16),
+        horizon=(0.10, 0.34, 0.42),
+        nadir=(0.03, 0.02, 0.08),
         glows=[((5, 5.6, 6.4), (-0.75, -0.45, 0.35), 12), ((1.6, 0.7, 0.3), (0.9, -0.3, -0.3), 5)],
     )

@@ -36,8 +36,10 @@ def smooth_image(channels):
 
 
 def all_layers():
-    images = {key: random_image(len(layer.channels), seed)
-              for seed, (key, layer) in enumerate(LAYERS.items())}
+    images = {
+        key: random_image(len(layer.channels), seed)
+        for seed, (key, layer) in enumerate(LAYERS.items())
+    }
     return images | {
         "position": 100 * images["position"] - 50,
         "normal": 2 * images["normal"] - 1,

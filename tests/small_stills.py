@@ -41,14 +41,27 @@ def description(size=8, rfilter="box", **integrator):
         "sensor": {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f().look_at([0.1, 0.1, 0.6], [0.7, 1, 0.4], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": size, "height": size,
-                     "component_format": "float32", "rfilter": {"type": rfilter}},
+            "film": {
+                "type": "hdrfilm",
+                "width": size,
+                "height": size,
+                "component_format": "float32",
+                "rfilter": {"type": rfilter},
+            },
         },
-        "lamp": {"type": "sphere", "center": [0.3, 0.4, 0.8], "radius": 0.1,
-                 "light": {"type": "area"}},
+        "lamp": {
+            "type": "sphere",
+            "center": [0.3, 0.4, 0.8],
+            "radius": 0.1,
+            "light": {"type": "area"},
+        },
         "sky": {"type": "constant", "radiance": 0.1},
-        "ball": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.2,
-                 "bsdf": {"type": "diffuse"}},
+        "ball": {
+            "type": "sphere",
+            "center": [0.5, 0.5, 0.5],
+            "radius": 0.2,
+            "bsdf": {"type": "diffuse"},
+        },
     }
 
 

@@ -11,8 +11,14 @@ from nil_mitsuba import geometry
 COUNT = 2_000
 
 # Half sizes of boxes about the identity and elsewhere: a cube, a ground, a wall, a tower, a speck
-BOXES = [((0, 0, 0), (1, 1, 1)), ((0, 0, 0.5), (10, 10, 0.5)), ((0, 0, 0.5), (1000, 1000, 0.5)),
-         ((3, 40, 0), (0.1, 60, 5)), ((20, -7, 200), (3, 3, 200)), ((60, 0, 0), (0.05, 0.05, 0.05))]
+BOXES = [
+    ((0, 0, 0), (1, 1, 1)),
+    ((0, 0, 0.5), (10, 10, 0.5)),
+    ((0, 0, 0.5), (1000, 1000, 0.5)),
+    ((3, 40, 0), (0.1, 60, 5)),
+    ((20, -7, 200), (3, 3, 200)),
+    ((60, 0, 0), (0.05, 0.05, 0.05)),
+]
 
 
 def box_and_rays(centre, half, seed=3):
@@ -26,8 +32,11 @@ def box_and_rays(centre, half, seed=3):
     tilt = dr.select(u[5] < 0.15, 1e-3, dr.select(u[5] > 0.85, 1e3, mi.Float(1)))
     v = dr.normalize(mi.Vector3f(v.x, v.y, v.z * tilt))
     reach = dr.power(10, 3 * u[4] - 2)
-    p = mi.Point3f(centre) + mi.Vector3f(half) * (2 * mi.Vector3f(u[2], u[3], u[1]) - 1) \
+    p = (
+        mi.Point3f(centre)
+        + mi.Vector3f(half) * (2 * mi.Vector3f(u[2], u[3], u[1]) - 1)
         + reach * mi.warp.square_to_uniform_sphere(mi.Point2f(u[3], u[4]))
+    )
     return Box(mi.Point3f(centre) - mi.Vector3f(half), mi.Point3f(centre) + mi.Vector3f(half)), p, v
 
 
@@ -111,20 +120,38 @@ def test_a_vertex_that_no_triangle_uses_does_not_count(rgb, far):
 @pytest.mark.parametrize("bad", [dr.inf, -dr.inf, dr.nan, 1e30])
 @pytest.mark.parametrize("quotient", [False, True])
 @pytest.mark.parametrize("twist", [0.0, 1.0])
-def test_a_triangle_without_a_place_is_named_and_the_others_are_seen(rgb, bad, quotient, twist,
-                                                                     capfd):
+def test_a_triangle_without_a_place_is_named_and_the_others_are_seen(
+    rgb, bad, quotient, twist, capfd
+):
     """At twist 0 it made the whole mesh vanish, at twist 1 the render had no end."""
     vertices, faces = TRIANGLES
     spoilt = mesh([*vertices, (0.5, bad, 0.2)], [*faces, (0, 1, 4)])
     pictures = []
     for one in (mesh(vertices, faces), spoilt):
-        scene = mi.load_dict({
-            "type": "scene", "sky": {"type": "constant"}, "spoilt": one,
-            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8},
-                       "to_world": mi.ScalarTransform4f().look_at(
-                           [0.5, 0.3, 0.9], [0.5, 0.5, 0.1], [0, 1, 0])}})
-        nil = mi.load_dict({"type": "nil", "quotient": quotient, "twist": twist, "max_depth": 1,
-                            "max_distance": 3.0, "aovs": "distance"})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sky": {"type": "constant"},
+                "spoilt": one,
+                "sensor": {
+                    "type": "perspective",
+                    "film": {"type": "hdrfilm", "width": 8, "height": 8},
+                    "to_world": mi.ScalarTransform4f().look_at(
+                        [0.5, 0.3, 0.9], [0.5, 0.5, 0.1], [0, 1, 0]
+                    ),
+                },
+            }
+        )
+        nil = mi.load_dict(
+            {
+                "type": "nil",
+                "quotient": quotient,
+                "twist": twist,
+                "max_depth": 1,
+                "max_distance": 3.0,
+                "aovs": "distance",
+            }
+        )
         image = mi.render(scene, integrator=nil, spp=1)
         pictures.append(image[:, :, 3].array)
     assert dr.all(pictures[0] == pictures[1]) and dr.any(pictures[0] > 0)
@@ -134,15 +161,22 @@ def test_a_triangle_without_a_place_is_named_and_the_others_are_seen(rgb, bad, q
 
 def ground(half):
     """The layers of a ball on a ground of a half size, with the light of an even sky."""
-    scene = mi.load_dict({
-        "type": "scene", "sky": {"type": "constant"},
-        "ground": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half)},
-        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
-        "sensor": {"type": "perspective", "film": film(32, 32),
-                   "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0.5],
-                                                              [0, 0, 1])}})
-    nil = mi.load_dict({"type": "nil", "quotient": False, "max_depth": 3,
-                        "aovs": "distance, position"})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant"},
+            "ground": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half)},
+            "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
+            "sensor": {
+                "type": "perspective",
+                "film": film(32, 32),
+                "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0.5], [0, 0, 1]),
+            },
+        }
+    )
+    nil = mi.load_dict(
+        {"type": "nil", "quotient": False, "max_depth": 3, "aovs": "distance, position"}
+    )
     return mi.render(scene, integrator=nil, spp=1)
 
 

@@ -15,6 +15,7 @@ from nil_mitsuba import geometry
 def methods(rgb):
     """The module of the other methods, which is imported when a variant is set."""
     from benchmarks import tracing_methods
+
     return tracing_methods
 
 
@@ -22,12 +23,14 @@ def methods(rgb):
 def chart(rgb):
     """The package that measures for the chart; its modules are imported when a variant is set."""
     import benchmarks.chart.__main__
+
     return benchmarks.chart
 
 
 # ---------------------------------------------------------------------------
 #  End points
 # ---------------------------------------------------------------------------
+
 
 def test_fixed_steps_converge_at_their_order(methods, chart):
     """Halving the step divides the error by 2 (Euler) and by 16 (Runge–Kutta 4)."""
@@ -90,13 +93,16 @@ def test_accelerations_come_from_the_christoffel_symbols(methods):
 #  First hits
 # ---------------------------------------------------------------------------
 
+
 @pytest.fixture
 def errors(chart):
     """What a method errs by in a scene of the chart, up to 5 cells: a row of the table."""
+
     def of(selection, method, knob, tolerance=1.0):
         rays = selection.rays
         tracer = chart.methods.tracer_of(method, knob, rays.scene, rays.space)
         return chart.rays.errors(tracer, selection, tolerance)
+
     return of
 
 
@@ -112,8 +118,12 @@ def up_to_5_cells(chart, rays):
 def test_chords_converge_to_the_true_hits(chart, errors, place):
     """A third of the step makes a ninth of the error where the ends of chords are exact."""
     selection = up_to_5_cells(chart, rays_of(chart, place, 48))
-    factors = {"Euler pieces": (2, 4.5), "Runge–Kutta 4": (6, 13), "stable form": (6, 13),
-               "printed form": (6, 13)}
+    factors = {
+        "Euler pieces": (2, 4.5),
+        "Runge–Kutta 4": (6, 13),
+        "stable form": (6, 13),
+        "printed form": (6, 13),
+    }
     for method, (least, most) in factors.items():
         coarse, fine = (errors(selection, method, step) for step in (0.06, 0.02))
         assert least < coarse["position"] / fine["position"] < most
@@ -137,8 +147,9 @@ ERRORS = (6e-7, 5e-6), (6e-7, 5e-6), (6e-7, 5e-6), (6e-7, 5e-6), (2e-6, 4e-5), (
 @pytest.mark.parametrize("place, limits", list(enumerate(ERRORS)))
 def test_the_package_finds_the_true_hits_of_every_scene_of_the_chart(chart, errors, place, limits):
     default = chart.methods.DEFAULT
-    row = errors(up_to_5_cells(chart, rays_of(chart, place, 48)), chart.methods.PACKAGE, default,
-                 default)
+    row = errors(
+        up_to_5_cells(chart, rays_of(chart, place, 48)), chart.methods.PACKAGE, default, default
+    )
     assert row["hits"] > 0.1 * row["rays"]
     assert row["position"] < limits[0]
     assert row["position 99 %"] < limits[1]
@@ -154,9 +165,12 @@ def test_dividing_by_w_makes_no_number_of_horizontal_rays(rgb, chart, errors):
     rays = rays_of(chart, 1, 16)
     rays.v = rgb.Vector3f(dr.normalize(rgb.Vector3f(rays.v.x, rays.v.y, 0)))
     selection = up_to_5_cells(chart, rays)
-    for method, knob, share in (("printed form", 0.1, 1), ("stable form", 0.1, 0),
-                                ("Runge–Kutta 4", 0.1, 0),
-                                (chart.methods.PACKAGE, chart.methods.DEFAULT, 0)):
+    for method, knob, share in (
+        ("printed form", 0.1, 1),
+        ("stable form", 0.1, 0),
+        ("Runge–Kutta 4", 0.1, 0),
+        (chart.methods.PACKAGE, chart.methods.DEFAULT, 0),
+    ):
         assert errors(selection, method, knob)["not a number"] == share
 
 
@@ -164,12 +178,16 @@ def test_dividing_by_w_makes_no_number_of_horizontal_rays(rgb, chart, errors):
 #  Image difference
 # ---------------------------------------------------------------------------
 
+
 def colours(mi, shift):
     """An image of 64 × 48 whose features and colours move with ``shift``."""
     index = dr.arange(mi.UInt32, 64 * 48)
     x, y = mi.Float(index % 64) / 64, mi.Float(index // 64) / 48
-    rgb = mi.Color3f(x ** (1 + shift), y + shift * 0.05 * dr.sin(40 * y),
-                     0.5 + 0.5 * dr.sin(20 * x + shift) * dr.cos(15 * y))
+    rgb = mi.Color3f(
+        x ** (1 + shift),
+        y + shift * 0.05 * dr.sin(40 * y),
+        0.5 + 0.5 * dr.sin(20 * x + shift) * dr.cos(15 * y),
+    )
     return mi.TensorXf(dr.ravel(rgb), (48, 64, 3))
 
 
@@ -194,11 +212,13 @@ def test_flip_refuses_images_of_different_sizes(rgb):
 #  The script
 # ---------------------------------------------------------------------------
 
+
 def test_one_command_writes_tables_and_charts_without_numpy(fresh_python, tmp_path):
     done = fresh_python(
         f"import runpy, sys; sys.argv = ['', '--quick', '-o', {str(tmp_path)!r}]\n"
         "runpy.run_module('benchmarks.chart', run_name='__main__', alter_sys=True)\n"
-        "print('numpy loaded:', 'numpy' in sys.modules)")
+        "print('numpy loaded:', 'numpy' in sys.modules)"
+    )
     assert done.returncode == 0, done.stderr
     assert "numpy loaded: False" in done.stdout
     assert "end points at length 5" in done.stdout

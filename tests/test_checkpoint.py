@@ -36,8 +36,11 @@ CHANGES = {
     "size": (lambda: mi.load_dict(description(9)), {}, "size is 8,8 there and 9,9 here"),
     "layers": (lambda: mi.load_dict(description(aovs="shape")), {}, "layers is none there"),
     "seed": (lambda: mi.load_dict(description()), {"seed": 1}, "seed is 0 there and 1 here"),
-    "scene": (lambda: mi.load_dict(description() | {"sky": {"type": "constant", "radiance": 0.2}}),
-              {}, "the scene or a file that it names has changed"),
+    "scene": (
+        lambda: mi.load_dict(description() | {"sky": {"type": "constant", "radiance": 0.2}}),
+        {},
+        "the scene or a file that it names has changed",
+    ),
 }
 
 

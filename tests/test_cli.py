@@ -174,8 +174,18 @@ def test_bad_arguments_get_one_sentence_before_rendering(
     assert sorted(p.name for p in folder.iterdir()) == ["dir.exr", "scene.exr", "scene.xml"]
 
 
-@pytest.mark.parametrize("option", ["--noise=1", "--time=1s", "--resume", "--checkpoint=a.sums",
-                                    "--passes=0:1", "--pass-spp=1", "--layers=cell"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--noise=1",
+        "--time=1s",
+        "--resume",
+        "--checkpoint=a.sums",
+        "--passes=0:1",
+        "--pass-spp=1",
+        "--layers=cell",
+    ],
+)
 def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
     moment = '<integrator type="moment"><integrator type="nil"/></integrator>'
     (folder / "scene.xml").write_text(scene(moment, SENSOR, LAMP))
@@ -186,10 +196,14 @@ def test_what_needs_passes_is_refused_for_wrappers(command, folder, option):
 
 @pytest.mark.parametrize(
     "arguments, expected, fragments",
-    [(["info", "a.exr"], 1, ["a.exr"]), (["info", "scene.xml"], 1, ["scene.xml"]),
-     (["info", "a.sums"], 1, ["a.sums", "No such file"]), (["merge", "-o", "a.exr"], 2, ["PARTS"]),
-     (["merge", "scene.xml"], 2, ["-o"]),
-     (["merge", "scene.xml", "-o", "a.exr"], 1, ["scene.xml", "no checkpoint"])],
+    [
+        (["info", "a.exr"], 1, ["a.exr"]),
+        (["info", "scene.xml"], 1, ["scene.xml"]),
+        (["info", "a.sums"], 1, ["a.sums", "No such file"]),
+        (["merge", "-o", "a.exr"], 2, ["PARTS"]),
+        (["merge", "scene.xml"], 2, ["-o"]),
+        (["merge", "scene.xml", "-o", "a.exr"], 1, ["scene.xml", "no checkpoint"]),
+    ],
 )
 def test_files_that_are_not_there_or_something_else(command, arguments, expected, fragments):
     status, out, err = command(*arguments)
@@ -218,11 +232,11 @@ def test_a_traceback_is_there_for_those_who_ask(folder, monkeypatch):
 
 def test_mitsubas_messages_become_one_line():
     nested = (
-        '[parser.cpp:1718] At my scene.xml (line 4, col 4): failed to instantiate integrator '
+        "[parser.cpp:1718] At my scene.xml (line 4, col 4): failed to instantiate integrator "
         'plugin of type "nil": Traceback (most recent call last):\n'
         '  File "/x/registration.py", line 66, in construct\n'
         "    return f(props)\n           ^^^^^^^^\n"
-        "  File \"/x/integrator.py\", line 5, in __init__\n"
+        '  File "/x/integrator.py", line 5, in __init__\n'
         'RuntimeError: "twist" = 0.5 does not glue'
     )
     assert cli.tidy(nested) == (
@@ -241,9 +255,13 @@ def test_names_may_be_as_long_as_the_file_system_allows(command, folder, name):
 
 @pytest.mark.parametrize(
     "name, fragment",
-    [(300 * "a" + ".exr", "too long"), (251 * "a" + ".exr", "too long"),  # of its .sums
-     ("caf\udce9.exr", "UTF-8"), ("pipe.exr", "not an ordinary file"),
-     ("link.exr", "cannot write to the folder")],
+    [
+        (300 * "a" + ".exr", "too long"),
+        (251 * "a" + ".exr", "too long"),  # of its .sums
+        ("caf\udce9.exr", "UTF-8"),
+        ("pipe.exr", "not an ordinary file"),
+        ("link.exr", "cannot write to the folder"),
+    ],
 )
 def test_names_that_cannot_be_written_are_refused_before_rendering(
     command, folder, rendering_is_an_error, name, fragment

@@ -1,6 +1,5 @@
 """The command's checkpoints and parts: going on, merging, rendering again."""
 
-
 import pytest
 
 from command_line import LAMP, NIL, SENSOR, complaint, planes, read, scene
@@ -9,8 +8,9 @@ from nil_mitsuba import stills
 
 def test_a_checkpoint_that_is_named_stays_and_more_samples_go_on_with_it(command, folder):
     for spp in ("8", "24"):
-        status, out, err = command("render", "scene.xml", "--spp", spp, "--checkpoint", "a.sums",
-                                   "--resume", "-q")
+        status, out, err = command(
+            "render", "scene.xml", "--spp", spp, "--checkpoint", "a.sums", "--resume", "-q"
+        )
         assert (status, out, err) == (0, "", "")
     assert (folder / "a.sums").exists()
     header, _, pixels = read("scene.exr")
@@ -46,8 +46,9 @@ def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
     status, out, err = command("merge", *parts, "-o", "merged.exr")
     assert (status, out) == (0, "merged.exr\n")
     assert err == "the passes 1:2 of 0:4 are missing.\n"
-    status, out, err = command("merge", *parts, "scene.1-2.sums", "-o", "merged.exr", "--png",
-                               "merged.png")
+    status, out, err = command(
+        "merge", *parts, "scene.1-2.sums", "-o", "merged.exr", "--png", "merged.png"
+    )
     assert (status, out, err) == (0, "merged.exr\nmerged.png\n", "")
     merged = planes("merged.exr")
     for name in "RGB":
@@ -83,8 +84,18 @@ def test_merged_parts_can_be_denoised(command, meshes):
     command("render", "scene.xml", "--spp", "8", "--passes", "0:1", "-o", "a.sums")
     status, _, err = command("merge", "a.sums", "-o", "a.exr", "--denoise")
     assert status == 1 and "--denoise needs the layers albedo and normal" in complaint(err)
-    command("render", "scene.xml", "--spp", "8", "--passes", "0:1", "-o", "b.sums", "--layers",
-            "albedo,normal")
+    command(
+        "render",
+        "scene.xml",
+        "--spp",
+        "8",
+        "--passes",
+        "0:1",
+        "-o",
+        "b.sums",
+        "--layers",
+        "albedo,normal",
+    )
     assert command("merge", "b.sums", "-o", "b.exr", "--denoise")[0] == 0
     assert "noisy.R" in planes("b.exr")
 

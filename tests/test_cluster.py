@@ -22,9 +22,12 @@ JOB = Job("scene.xml")
 @pytest.fixture(scope="module")
 def client():
     """A cluster of two workers within this process, with Dask's own scheduler."""
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    ) as workers, distributed.Client(workers) as client:
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as workers,
+        distributed.Client(workers) as client,
+    ):
         yield client
 
 
@@ -129,9 +132,7 @@ def test_a_worker_with_another_scene_is_left_out(hands, monkeypatch):
 
     monkeypatch.setattr(cluster, "render_part", render_part)
     assert came(hands) == list(range(10))
-    assert hands.complaints == [
-        f'{bad} is left out: "scene.xml" or a file that it names differs.'
-    ]
+    assert hands.complaints == [f'{bad} is left out: "scene.xml" or a file that it names differs.']
 
 
 def test_a_scene_that_no_worker_has_ends_in_a_sentence(client):
@@ -215,9 +216,12 @@ def test_parts_that_came_before_an_error_are_saved(job, tmp_path):
 
 
 def test_a_cluster_without_workers_ends_in_a_sentence():
-    with distributed.LocalCluster(
-        n_workers=0, processes=False, dashboard_address="127.0.0.1:0"
-    ) as empty, distributed.Client(empty) as client:
+    with (
+        distributed.LocalCluster(
+            n_workers=0, processes=False, dashboard_address="127.0.0.1:0"
+        ) as empty,
+        distributed.Client(empty) as client,
+    ):
         hands = cluster.Hands(client, JOB, cluster.Queue(range(4), 4), None, print)
         with pytest.raises(OSError, match='no workers: start some with "dask worker"'):
             came(hands)
@@ -245,7 +249,14 @@ def test_without_the_extra_a_sentence_says_how_to_get_it(fresh_python, tmp_path)
 
 def test_one_cluster_is_enough(tmp_path, monkeypatch, capsys):
     (tmp_path / "scene.xml").write_text(SCENE)
-    arguments = ["render", str(tmp_path / "scene.xml"), "--workers", "2", "--scheduler", "tcp://a:1"]
+    arguments = [
+        "render",
+        str(tmp_path / "scene.xml"),
+        "--workers",
+        "2",
+        "--scheduler",
+        "tcp://a:1",
+    ]
     monkeypatch.setattr(sys, "argv", ["nil-mitsuba", *arguments])
     with pytest.raises(SystemExit) as status:
         cli.main()
@@ -262,8 +273,13 @@ def job(tmp_path, rgb):
     scene = SCENE.replace('name="height" value="$resolution"', 'name="height" value="18"')
     (tmp_path / "scene.xml").write_text(scene)
     (tmp_path / "triangle.obj").write_text(TRIANGLE)
-    job = Job(str(tmp_path / "scene.xml"), defines={"resolution": "32"}, spp=24 * 64,
-              pass_spp=64, properties={"aovs": "distance,cell"})
+    job = Job(
+        str(tmp_path / "scene.xml"),
+        defines={"resolution": "32"},
+        spp=24 * 64,
+        pass_spp=64,
+        properties={"aovs": "distance,cell"},
+    )
     return replace(job, scene_hash=jobs.open_still(job).settings["scene"])
 
 
@@ -274,9 +290,12 @@ def test_a_killed_worker_changes_nothing_in_the_picture(job, monkeypatch):
     alone, number = still.accumulate(still.nothing(), map(still.render, range(24)))
     assert number is None
 
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, memory_limit=None, dashboard_address="127.0.0.1:0"
-    ) as workers, distributed.Client(workers) as client:
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, memory_limit=None, dashboard_address="127.0.0.1:0"
+        ) as workers,
+        distributed.Client(workers) as client,
+    ):
         pids = set(client.run(os.getpid).values())
 
         def parts():

@@ -81,7 +81,9 @@ def material(name):
 def test_an_error_of_a_plugin_while_paths_are_traced_is_told(render, broken):
     broken.append(ValueError("the material has run out of paint."))
     assert render(material("broken"), "--spp", "1") == (
-        1, "", "nil-mitsuba: the material has run out of paint.\n"
+        1,
+        "",
+        "nil-mitsuba: the material has run out of paint.\n",
     )
 
 

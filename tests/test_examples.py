@@ -11,8 +11,13 @@ from conftest import ENVIRONMENT, ROOT
 
 def run(program, *arguments):
     """Run a program of examples/; the one line it prints last."""
-    result = subprocess.run([sys.executable, str(ROOT / "examples" / program), *arguments],
-                            capture_output=True, text=True, timeout=300, env=ENVIRONMENT)
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / program), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=ENVIRONMENT,
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout.splitlines()[-1]
 
@@ -29,13 +34,20 @@ def shows_something(mi, path, height=None, width=None):
     return picture.shape
 
 
-@pytest.mark.parametrize("program, arguments, shape, first", [
-    ("render_from_python.py", ["--size", "48", "--spp", "2"], (56, 48), (24, 48)),
-    ("walk.py", ["--size", "32", "--spp", "1", "--frames", "3", "--columns", "2"],
-     (44, 72), (18, 32)),
-    ("twist.py", ["--size", "24", "--spp", "2"], (24, 88), (24, 24)),
-    ("own_mesh.py", ["--size", "48", "--spp", "2"], (27, 48), (27, 48)),
-])
+@pytest.mark.parametrize(
+    "program, arguments, shape, first",
+    [
+        ("render_from_python.py", ["--size", "48", "--spp", "2"], (56, 48), (24, 48)),
+        (
+            "walk.py",
+            ["--size", "32", "--spp", "1", "--frames", "3", "--columns", "2"],
+            (44, 72),
+            (18, 32),
+        ),
+        ("twist.py", ["--size", "24", "--spp", "2"], (24, 88), (24, 24)),
+        ("own_mesh.py", ["--size", "48", "--spp", "2"], (27, 48), (27, 48)),
+    ],
+)
 def test_example_ends_in_a_picture(rgb, tmp_path, program, arguments, shape, first):
     picture = tmp_path / "picture.exr"  # EXR would keep a NaN
     line = run(program, "-o", str(picture), *arguments)
@@ -44,8 +56,19 @@ def test_example_ends_in_a_picture(rgb, tmp_path, program, arguments, shape, fir
 
 
 def test_walk_writes_frames_for_a_film(rgb, tmp_path):
-    run("walk.py", "-o", str(tmp_path / "sheet.png"), "--frames-to", str(tmp_path / "film"),
-        "--frames", "2", "--size", "32", "--spp", "1")
+    run(
+        "walk.py",
+        "-o",
+        str(tmp_path / "sheet.png"),
+        "--frames-to",
+        str(tmp_path / "film"),
+        "--frames",
+        "2",
+        "--size",
+        "32",
+        "--spp",
+        "1",
+    )
     assert [path.name for path in sorted((tmp_path / "film").iterdir())] == ["000.png", "001.png"]
 
 
@@ -66,10 +89,23 @@ def test_any_mesh_stands_in_the_cube(rgb, tmp_path):
     # Upright along y, large and far from the origin
     mesh = tmp_path / "tower.obj"
     corners = [(100 + x, 20 + 9 * y, -50 + z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
-    faces = [(1, 3, 4), (1, 4, 2), (5, 6, 8), (5, 8, 7), (1, 5, 7), (1, 7, 3), (2, 4, 8),
-             (2, 8, 6), (3, 7, 8), (3, 8, 4)]
-    mesh.write_text("\n".join(["v {} {} {}".format(*c) for c in corners]
-                              + ["f {} {} {}".format(*f) for f in faces]))
+    faces = [
+        (1, 3, 4),
+        (1, 4, 2),
+        (5, 6, 8),
+        (5, 8, 7),
+        (1, 5, 7),
+        (1, 7, 3),
+        (2, 4, 8),
+        (2, 8, 6),
+        (3, 7, 8),
+        (3, 8, 4),
+    ]
+    mesh.write_text(
+        "\n".join(
+            ["v {} {} {}".format(*c) for c in corners] + ["f {} {} {}".format(*f) for f in faces]
+        )
+    )
     picture = tmp_path / "picture.exr"
     run("own_mesh.py", str(mesh), "--up", "y", "-o", str(picture), "--size", "32", "--spp", "1")
     shows_something(rgb, picture)
@@ -82,8 +118,12 @@ def test_any_mesh_stands_in_the_cube(rgb, tmp_path):
 
 
 def test_own_mesh_says_what_it_reads():
-    result = subprocess.run([sys.executable, str(ROOT / "examples" / "own_mesh.py"), "a.stl"],
-                            capture_output=True, text=True, timeout=60)
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "own_mesh.py"), "a.stl"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert result.returncode == 2
     assert '"a.stl" is no mesh that this program reads: give a .ply or .obj.' in result.stderr
 
@@ -128,8 +168,9 @@ def test_a_floor_behind_a_corner_of_the_cell_is_one_storey_up(rgb):
 
 
 def test_winding_floor_goes_on_from_cell_to_cell(rgb):
-    floor = rgb.load_dict({"type": "ply",
-                           "filename": str(ROOT / "scenes" / "meshes" / "winding-floor.ply")})
+    floor = rgb.load_dict(
+        {"type": "ply", "filename": str(ROOT / "scenes" / "meshes" / "winding-floor.ply")}
+    )
     points = dr.unravel(rgb.Point3f, rgb.traverse(floor)["vertex_positions"])
     points = list(zip(*points))
     for axis, shear in ((0, 1), (1, 0)):
@@ -150,9 +191,21 @@ def test_winding_floor_goes_on_from_cell_to_cell(rgb):
 def test_pictures_of_the_explanation_are_made_by_their_script(rgb, tmp_path):
     pytest.importorskip("altair")
     pytest.importorskip("vl_convert")
-    result = subprocess.run([sys.executable, str(ROOT / "docs" / "pictures.py"), "--size", "96",
-                             "--spp", "1", "--to", str(tmp_path)],
-                            capture_output=True, text=True, timeout=300)
+    result = subprocess.run(
+        [
+            sys.executable,
+            str(ROOT / "docs" / "pictures.py"),
+            "--size",
+            "96",
+            "--spp",
+            "1",
+            "--to",
+            str(tmp_path),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert result.returncode == 0, result.stderr
     pictures = sorted(path.name for path in tmp_path.iterdir())
     text = (ROOT / "docs" / "looking-at-nil.md").read_text(encoding="utf-8")
@@ -162,8 +215,18 @@ def test_pictures_of_the_explanation_are_made_by_their_script(rgb, tmp_path):
 
 
 def test_gallery_renders_stills_and_their_contact_sheet(rgb, tmp_path):
-    line = run("gallery.py", "nave", "shell", "--to", str(tmp_path), "--size", "32", "--spp", "1",
-               "--no-denoise")
+    line = run(
+        "gallery.py",
+        "nave",
+        "shell",
+        "--to",
+        str(tmp_path),
+        "--size",
+        "32",
+        "--spp",
+        "1",
+        "--no-denoise",
+    )
     assert line == f"{tmp_path / 'contact-sheet.jpg'}: 2 stills"
     assert shows_something(rgb, tmp_path / "nave.jpg")[:2] == (18, 32)
     assert shows_something(rgb, tmp_path / "contact-sheet.jpg", 18, 32)[:2] == (18, 72)

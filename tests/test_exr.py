@@ -45,13 +45,14 @@ def read_channels(path):
 
 @pytest.mark.parametrize("compression", exr.COMPRESSIONS)
 @pytest.mark.parametrize("component_format", ["float16", "float32"])
-def test_layers_keep_their_values_whatever_the_compression(
-    tmp_path, compression, component_format
-):
+def test_layers_keep_their_values_whatever_the_compression(tmp_path, compression, component_format):
     picture, layers = smooth_image(4), all_layers() | {"noisy": smooth_image(3)}
     exr.write(
-        tmp_path / "a.exr", ("RGBA", picture), layers,
-        component_format=component_format, compression=compression,
+        tmp_path / "a.exr",
+        ("RGBA", picture),
+        layers,
+        component_format=component_format,
+        compression=compression,
     )
     types, channels = read_channels(tmp_path / "a.exr")
 
@@ -204,14 +205,17 @@ def test_a_film_is_written_in_its_own_format(tmp_path):
     assert types == {"Y": "uint32"} and dr.max(channels["Y"].array) == 9
 
 
-@pytest.mark.parametrize("arguments, words", [
-    ({"layers": {"depth": (1,)}}, ['"depth"', "distance", "position"]),
-    ({"layers": {"cell": (1,)}}, ["cell.X, cell.Y, cell.Z", str((HEIGHT, WIDTH, 3))]),
-    ({"compression": "jpeg"}, ['"jpeg"', "zip", "dwaa"]),
-    ({"component_format": "float64"}, ['"float64"', "float16"]),
-    ({"picture": "RGBA"}, ["R, G, B, A", str((HEIGHT, WIDTH, 4)), str((HEIGHT, WIDTH, 3))]),
-    ({"picture": "RGR"}, ['two channels "R"']),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ({"layers": {"depth": (1,)}}, ['"depth"', "distance", "position"]),
+        ({"layers": {"cell": (1,)}}, ["cell.X, cell.Y, cell.Z", str((HEIGHT, WIDTH, 3))]),
+        ({"compression": "jpeg"}, ['"jpeg"', "zip", "dwaa"]),
+        ({"component_format": "float64"}, ['"float64"', "float16"]),
+        ({"picture": "RGBA"}, ["R, G, B, A", str((HEIGHT, WIDTH, 4)), str((HEIGHT, WIDTH, 3))]),
+        ({"picture": "RGR"}, ['two channels "R"']),
+    ],
+)
 def test_what_does_not_fit_together_is_named(tmp_path, arguments, words):
     picture = arguments.pop("picture", "RGB"), random_image(3)
     layers = {key: random_image(*n) for key, n in arguments.pop("layers", {}).items()}
@@ -228,9 +232,16 @@ def test_the_description_tells_size_layers_and_metadata(tmp_path):
     assert lines[0] == f"{tmp_path / 'a.exr'}: {WIDTH} x {HEIGHT} pixels, compression zip"
     words = [line.split() for line in lines]
     for row in (
-        "(picture) R G B A float16", "albedo R G B float16", "cell X Y Z float32",
-        "depth Z float32", "samples X float32", "spp 64", "seed 4294967295", "tolerance 0.25",
-        "renderTime 12.345678901", "quotient true",
+        "(picture) R G B A float16",
+        "albedo R G B float16",
+        "cell X Y Z float32",
+        "depth Z float32",
+        "samples X float32",
+        "spp 64",
+        "seed 4294967295",
+        "tolerance 0.25",
+        "renderTime 12.345678901",
+        "quotient true",
     ):
         assert row.split() in words, row
     # A value of several lines stays in its column.
@@ -245,18 +256,32 @@ def test_files_of_others_are_described_too(tmp_path):
 
     plane = mi.TensorXf(random_image(1)[:, :, 0]).numpy()
     left = OpenEXR.Part(
-        {"type": OpenEXR.tiledimage, "compression": OpenEXR.PIZ_COMPRESSION, "owner": "Ada",
-         "tiles": OpenEXR.TileDescription(), "focus": 0.1, "tags": ["a", "b"],
-         "preview": OpenEXR.PreviewImage(1, 1), "whitePoint": (0.3127, 0.3290)},
-        {"R": plane, "other.long": plane}, "left",
+        {
+            "type": OpenEXR.tiledimage,
+            "compression": OpenEXR.PIZ_COMPRESSION,
+            "owner": "Ada",
+            "tiles": OpenEXR.TileDescription(),
+            "focus": 0.1,
+            "tags": ["a", "b"],
+            "preview": OpenEXR.PreviewImage(1, 1),
+            "whitePoint": (0.3127, 0.3290),
+        },
+        {"R": plane, "other.long": plane},
+        "left",
     )
     right = OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"Z": plane}, "right")
     with OpenEXR.File([left, right]) as file:
         file.write(str(tmp_path / "a.exr"))
     text = exr.describe(tmp_path / "a.exr")
     for words in (
-        'part "left", 53 x 37 pixels, compression piz, in tiles', 'part "right"', "owner",
-        "Ada", "0.1\n", "a, b", "(preview, ", "0.3127",
+        'part "left", 53 x 37 pixels, compression piz, in tiles',
+        'part "right"',
+        "owner",
+        "Ada",
+        "0.1\n",
+        "a, b",
+        "(preview, ",
+        "0.3127",
     ):
         assert words in text, words
     assert metadata_of(tmp_path / "a.exr")["owner"] == "Ada"

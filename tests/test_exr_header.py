@@ -36,8 +36,10 @@ def test_what_is_not_an_exr_file_gets_one_sentence(tmp_path):
     (tmp_path / "a.exr").write_text("hello")
     (tmp_path / "empty.exr").touch()
     for name, words in {
-        "a.exr": "is not an OpenEXR file", "empty.exr": "is not an OpenEXR file",
-        "none.exr": "No such file", ".": "directory",
+        "a.exr": "is not an OpenEXR file",
+        "empty.exr": "is not an OpenEXR file",
+        "none.exr": "No such file",
+        ".": "directory",
     }.items():
         for function in (exr.describe, exr_header.read):
             with pytest.raises((OSError, ValueError)) as error:

@@ -39,6 +39,7 @@ class Plane:
     def contains(self, p):
         return Bool(True)
 
+
 def scanned(p, v, axis, c, t_max, twist, step=truth.STEP):
     return truth.first_hit([Plane(axis, c)], p, v, t_max, twist, quotient=False, step=step).t
 
@@ -64,10 +65,12 @@ def check_against_scan(p, v, c, axis, twist, t_max=12.0):
     assert len(again) <= 1e-3 * count
     if len(again) > 0:
         rays = dr.gather(Array3f64, p, again), dr.gather(Array3f64, v, again)
-        wrong = disagrees(*rays, dr.gather(Float64, c, again), dr.gather(Float64, t, again),
-                          truth.STEP / 100)
+        wrong = disagrees(
+            *rays, dr.gather(Float64, c, again), dr.gather(Float64, t, again), truth.STEP / 100
+        )
         assert len(wrong) == 0
     return dr.count(dr.isfinite(t))[0] / count
+
 
 def check_faces(count, axis, twist):
     p, v, u = random_rays(count)
@@ -77,15 +80,18 @@ def check_faces(count, axis, twist):
     # With hardly a twist a tangent ray runs along its plane
     assert crossing > 0.4 or abs(twist) < 0.1
 
+
 @pytest.mark.parametrize("twist", [0, 1e-6, 1, -3])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_first_crossing_of_a_face_is_that_of_the_scan(axis, twist):
     check_faces(4000, axis, twist)
 
+
 @pytest.mark.verify
 @pytest.mark.parametrize("axis, twist", [(0, 1), (1, 1), (2, 1), (2, -2)])
 def test_first_crossings_of_a_million_rays_are_those_of_the_scan(axis, twist):
     check_faces(800_000, axis, twist)
+
 
 def largest_coordinate(p, v, t_max, twist):
     """Largest coordinate along each ray, from 20 steps."""
@@ -95,6 +101,7 @@ def largest_coordinate(p, v, t_max, twist):
         largest = dr.maximum(largest, dr.max(dr.abs(q)))
         dr.eval(largest)
     return largest
+
 
 def check_float32(count, axis, twist):
     """``count`` random rays and as many tangent ones in float32, for a plane off by what ``flow``
@@ -120,10 +127,12 @@ def check_float32(count, axis, twist):
         assert dr.count(wrong)[0] == 0
         assert dr.all(~dr.isnan(t))
 
+
 @pytest.mark.parametrize("twist", [1e-6, 1, -3])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_first_crossing_of_a_face_in_float32_is_right_to_rounding(axis, twist):
     check_float32(40_000, axis, twist)
+
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist", [1, -3])
@@ -134,6 +143,7 @@ def test_first_crossings_of_z_of_a_million_rays_in_float32_are_right_to_rounding
 # ---------------------------------------------------------------------------
 #  What other methods give
 # ---------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("vector_t", [Array3f, Array3f64], ids=["float32", "float64"])
 @pytest.mark.parametrize("axis", [0, 1])
@@ -153,6 +163,7 @@ def test_the_reports_crossing_of_the_face_ahead_is_wrong_for_half_of_all_rays(ve
     # The same rays, both branches, in the same precision
     assert rays_off(first_crossing(p, v, axis, face, FURTHER), exact) == 0
 
+
 @pytest.mark.parametrize("name", ["Runge–Kutta 4", "Dormand–Prince"])
 def test_chords_of_an_ode_method_pass_faces_that_a_ray_only_just_crosses(rgb, name):
     """One in 1,000 faces ahead, one in 30 planes that are crossed twice within a chord."""
@@ -171,6 +182,7 @@ def test_chords_of_an_ode_method_pass_faces_that_a_ray_only_just_crosses(rgb, na
 #  Walls
 # ---------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("twist", [0, 1e-6, 0.3, 1, 2, 3, 8])
 def test_walls_of_a_room_are_met_where_their_planes_are_crossed(rgb, twist):
     """No ray leaves the cube |x|, |y|, |z| ≤ 1 early, late, or never, through edges neither."""
@@ -181,8 +193,11 @@ def test_walls_of_a_room_are_met_where_their_planes_are_crossed(rgb, twist):
     δ = allowance(t, twist)
 
     def leaves_room(half_width):
-        walls = [first_crossing(p, v, axis, side * half_width, 40.0, twist)
-                 for axis in range(3) for side in (-1, 1)]
+        walls = [
+            first_crossing(p, v, axis, side * half_width, 40.0, twist)
+            for axis in range(3)
+            for side in (-1, 1)
+        ]
         nearest = walls[0]
         for wall in walls[1:]:
             nearest = dr.minimum(nearest, wall)
@@ -190,6 +205,7 @@ def test_walls_of_a_room_are_met_where_their_planes_are_crossed(rgb, twist):
 
     wrong = dr.count(beyond(t, leaves_room(1 - δ), leaves_room(1 + δ), δ))[0]
     assert wrong == 0
+
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("twist", [1, -2])
@@ -217,8 +233,9 @@ def test_a_wall_through_the_cell_is_met_through_all_other_faces(rgb, axis, twist
     at_end = ~dr.isfinite(t) & (late > t_max - 1e-4)
     wrong = beyond(t, early, late, δ) & ~at_end
     # A ray that grazes the plane within its cone may go either way
-    grazing = wrong & ~beyond(t, leaves_layer(-SPREAD * t_max)[0], leaves_layer(SPREAD * t_max)[0],
-                              SPREAD * t_max)
+    grazing = wrong & ~beyond(
+        t, leaves_layer(-SPREAD * t_max)[0], leaves_layer(SPREAD * t_max)[0], SPREAD * t_max
+    )
     assert dr.count(wrong & ~grazing)[0] == 0
     assert dr.count(wrong)[0] <= 1e-4 * count
     # The copy that was hit is the one that the plane belongs to
@@ -227,6 +244,7 @@ def test_a_wall_through_the_cell_is_met_through_all_other_faces(rgb, axis, twist
     sure = dr.abs(t - exact) < 0.01
     assert dr.count(sure & (dr.abs(number - expected) > 0.5))[0] == 0
     assert dr.count(sure)[0] > 0.5 * count
+
 
 @pytest.mark.parametrize("twist", [0, 1, -2])
 def test_a_wall_across_the_fibres_is_met_where_its_plane_is_crossed(rgb, twist):
@@ -238,13 +256,17 @@ def test_a_wall_across_the_fibres_is_met_where_its_plane_is_crossed(rgb, twist):
     hit = Traced(truth.to_mitsuba([wall], rgb), p, v, twist, True, t_max)
 
     p, v, t = Array3f64(p), Array3f64(v), hit.t
-    column = dr.minimum(first_crossing(p, v, 0, Float64(0), t_max, twist),
-                        first_crossing(p, v, 0, Float64(1), t_max, twist))
+    column = dr.minimum(
+        first_crossing(p, v, 0, Float64(0), t_max, twist),
+        first_crossing(p, v, 0, Float64(1), t_max, twist),
+    )
     below = dr.select(p.z > c, c, c - 1)
 
     def leaves_layer(δ):
-        return dr.minimum(first_crossing(p, v, 2, below - δ, t_max + 1, twist),
-                          first_crossing(p, v, 2, below + 1 + δ, t_max + 1, twist))
+        return dr.minimum(
+            first_crossing(p, v, 2, below - δ, t_max + 1, twist),
+            first_crossing(p, v, 2, below + 1 + δ, t_max + 1, twist),
+        )
 
     δ = allowance(dr.minimum(t, t_max), twist)
     early, late = leaves_layer(-δ), leaves_layer(δ)

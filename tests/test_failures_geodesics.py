@@ -46,6 +46,7 @@ def longest_terms(t, twist):
 HORIZONTAL = [0.0, 1e-30, 1e-7, 1e-5, -1e-4, 1e-3, 1e-2]
 VERTICAL = [1.0, -1.0, 1 - 2**-24, 1 - 1e-5, -1 + 1e-3]
 
+
 @pytest.mark.parametrize("w", HORIZONTAL + VERTICAL + [0.3, -0.7])
 @pytest.mark.parametrize("twist", [1e-6, 1, -3])
 def test_no_fibre_component_costs_digits(w, twist):
@@ -55,12 +56,15 @@ def test_no_fibre_component_costs_digits(w, twist):
         error = errors_of_a_way(lambda p, v, t: geometry.flow(p, v, t, twist)[0], p, v, t, twist)
         assert dr.max(error)[0] <= 8 * ROUNDING * longest_terms(t, twist)
 
+
 def test_the_reports_geodesic_is_lost_as_the_ray_turns_horizontal():
     """Division by w²: nothing at w = 0, no digit below 1e-4, and three lost at w = 1e-2."""
+
     def worst(w):
         p, v = random_rays(5000, w)
-        return dr.max(errors_of_a_way(
-            lambda p, v, t: report_formulas.geodesic(p, v, t)[0], p, v, 5.0, 1))[0]
+        return dr.max(
+            errors_of_a_way(lambda p, v, t: report_formulas.geodesic(p, v, t)[0], p, v, 5.0, 1)
+        )[0]
 
     assert worst(0.0) == math.inf
     assert worst(1e-5) > 1
@@ -68,6 +72,7 @@ def test_the_reports_geodesic_is_lost_as_the_ray_turns_horizontal():
     assert worst(1e-2) > 1e3 * ROUNDING
     # It is the same geodesic where nothing cancels
     assert worst(0.7) < 1e-4
+
 
 @pytest.mark.parametrize("w", [1.0, -1.0])
 def test_vertical_rays_cross_the_faces_across_them_only(w):
@@ -81,6 +86,7 @@ def test_vertical_rays_cross_the_faces_across_them_only(w):
             assert not dr.any(dr.isfinite(report(p, v, value_t(1))))
         t = face_crossing.first_crossing(p, v, 2, value_t(2 * w), 100.0)
         assert dr.all(dr.abs(t - dr.abs(2 * w - p.z)) <= 1e-6)
+
 
 @pytest.mark.parametrize("vector_t", [Array3f, Array3f64], ids=["float32", "float64"])
 @pytest.mark.parametrize("twist", [1, -3])
@@ -111,6 +117,7 @@ def test_flow_is_smooth_where_its_formula_changes_for_every_direction(vector_t, 
 #  Long ways
 # ---------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("twist", [1, -3])
 def test_one_flow_over_a_long_way_errs_by_the_rounding_of_its_terms(twist):
     p, v = random_rays(4000)
@@ -118,11 +125,25 @@ def test_one_flow_over_a_long_way_errs_by_the_rounding_of_its_terms(twist):
         error = errors_of_a_way(lambda p, v, t: geometry.flow(p, v, t, twist)[0], p, v, t, twist)
         assert dr.max(error)[0] <= 8 * ROUNDING * longest_terms(t, twist)
 
+
 # Largest of 4,000 rays: where a walk ends, and where it is back at its start
-WALKS = {1: {1: (2.2e-7, 2.7e-7), 5: (1.3e-6, 2.1e-6), 20: (1.8e-5, 2.3e-5),
-             100: (2.6e-4, 7.7e-4), 500: (5.2e-3, 0.011)},
-         -3: {1: (4.1e-7, 5.2e-7), 5: (4.6e-6, 5.7e-6), 20: (5.9e-5, 8.5e-5),
-              100: (1.1e-3, 1.1e-3), 500: (0.015, 0.021)}}
+WALKS = {
+    1: {
+        1: (2.2e-7, 2.7e-7),
+        5: (1.3e-6, 2.1e-6),
+        20: (1.8e-5, 2.3e-5),
+        100: (2.6e-4, 7.7e-4),
+        500: (5.2e-3, 0.011),
+    },
+    -3: {
+        1: (4.1e-7, 5.2e-7),
+        5: (4.6e-6, 5.7e-6),
+        20: (5.9e-5, 8.5e-5),
+        100: (1.1e-3, 1.1e-3),
+        500: (0.015, 0.021),
+    },
+}
+
 
 @pytest.mark.parametrize("t", LENGTHS)
 @pytest.mark.parametrize("twist", WALKS)
@@ -131,16 +152,15 @@ def test_a_wrapped_ray_ends_where_the_unwrapped_one_does_and_walked_back_returns
     for error, measured in zip(walk_errors(t, twist), WALKS[twist][t]):
         assert dr.max(error)[0] <= 3 * measured
 
+
 def test_a_walk_by_the_directions_that_its_steps_end_in_is_lost(rgb):
     """A direction that is rounded at each step shortens: after 500 cells, and so by the ODE
     methods, which step so, rays end a cell off, a hundred times as far as by turning the first."""
     for twist in (1, -3):
-        wrapped, returned = walk_errors(
-            500, twist, walked=lambda *ray: walked(*ray, chained=True))
+        wrapped, returned = walk_errors(500, twist, walked=lambda *ray: walked(*ray, chained=True))
         assert dr.max(wrapped)[0] > 1 and dr.max(returned)[0] > 2
     for name, knob in (("Runge–Kutta 4", 0.05), ("Dormand–Prince", 1e-4), ("printed form", 0.05)):
-        wrapped, returned = walk_errors(
-            500, 1, 500, stepped(name, knob))
+        wrapped, returned = walk_errors(500, 1, 500, stepped(name, knob))
         assert dr.max(wrapped)[0] > 1 and dr.max(returned)[0] > 1
 
 
@@ -162,12 +182,14 @@ def test_far_from_the_origin_a_point_is_as_sharp_as_its_coordinates(exponent):
     here, there = geometry.flow(Array3f(0), v, Float(t), twist)[1], direction
     assert dr.all(here == there, axis=None)
 
+
 @pytest.mark.parametrize("twist", [1e-6, 1e-4, 1e-2, 0.3, 1, 2, 3, 8])
 def test_a_geodesic_of_any_twist_is_right_to_rounding(twist):
     p, v = random_rays(20_000)
     for t in (1.0, 5.0, 20.0):
         error = errors_of_a_way(lambda p, v, t: geometry.flow(p, v, t, twist)[0], p, v, t, twist)
         assert dr.max(error)[0] <= 8 * ROUNDING * longest_terms(t, twist)
+
 
 @pytest.mark.parametrize("twist", [1e-6, 1e-12, 1e-20])
 def test_a_small_twist_bends_in_proportion(twist):
@@ -196,6 +218,7 @@ FAILURES = {
     "a twist of 8": (None, 5, 0, 8, (0.02, 0.01, 1e-3), 6e-5),
 }
 
+
 @pytest.mark.parametrize("where", FAILURES)
 def test_each_failure_of_another_method_is_there_and_the_package_has_none(rgb, where):
     """The largest error of 4,000 rays; the package's bound is three times what was measured."""
@@ -205,9 +228,16 @@ def test_each_failure_of_another_method_is_there_and_the_package_has_none(rgb, w
         assert dr.max(end_point_errors(method, p + out, v, t, twist))[0] > least or least == 0
     assert dr.max(end_point_errors(package, p + out, v, t, twist))[0] <= bound
 
+
 def test_one_command_prints_the_tables_of_failures():
-    done = subprocess.run([sys.executable, "-m", "benchmarks.failures", "--quick"], cwd=ROOT,
-                          capture_output=True, text=True, timeout=300, env=ENVIRONMENT)
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.failures", "--quick"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=ENVIRONMENT,
+    )
     assert done.returncode == 0, done.stderr
     rows = [line.strip(" |").split(" | ") for line in done.stdout.splitlines() if "|" in line]
     heads = [i for i, row in enumerate(rows) if row[0] == "Where"]
@@ -219,6 +249,7 @@ def test_one_command_prints_the_tables_of_failures():
 # ---------------------------------------------------------------------------
 #  Cut points
 # ---------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("vector_t", [Array3f, Array3f64], ids=["float32", "float64"])
 @pytest.mark.parametrize("twist", [1, -2])
@@ -234,6 +265,7 @@ def test_connections_about_the_cut_point_land_on_it(vector_t, twist):
     assert dr.all(dr.isfinite(way.area_density) & (way.area_density >= 0))
     # As far as q is away, at most 6 cells here
     assert dr.all(dr.max(dr.abs(arrival - way.arrival)) <= 8 * limit)
+
 
 @pytest.mark.parametrize("vector_t", [Array3f, Array3f64], ids=["float32", "float64"])
 @pytest.mark.parametrize("twist", [1, -2])

@@ -52,11 +52,13 @@ from ztest import Estimate, assert_same_expectation
 #  Faces, edges and corners of the cell
 # ---------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("twist", [1, -2])
 def test_rays_aimed_at_faces_edges_and_corners_meet_the_true_surface(rgb, twist):
     kinds = list(AIMED)
-    _, exact, wrong, unexplained = compare(truth.cell_scene(), *aimed_rays(kinds, twist), twist,
-                                           True)
+    _, exact, wrong, unexplained = compare(
+        truth.cell_scene(), *aimed_rays(kinds, twist), twist, True
+    )
     assert not [kinds[i // COUNT] for i in unexplained]
     # 8 and 9 of 65,000 are measured
     assert len(wrong) <= 4e-4 * COUNT * len(kinds)
@@ -71,7 +73,7 @@ def test_rays_along_a_face_meet_the_wall_before_them(rgb, twist, axis):
     """None passes by, and none mistakes the copy: k storeys lie between neighbours at y = 1."""
     wrong, error = walls_along_faces(axis, twist)
     assert wrong == 0
-    assert error <= 2e-6    # 6.5e-7 is measured
+    assert error <= 2e-6  # 6.5e-7 is measured
 
 
 # ---------------------------------------------------------------------------
@@ -81,18 +83,26 @@ def test_rays_along_a_face_meet_the_wall_before_them(rgb, twist, axis):
 # Largest errors in the four bands
 LONG_RAYS = {1: (1.4e-6, 9e-6, 6e-5, 5e-4), 3: (4.9e-6, 4.1e-5, 3.6e-4, 1.6e-3)}
 
-@pytest.mark.parametrize("twist, bins", [
-    (1, NEAR), (3, NEAR),
-    *(pytest.param(twist, FAR, marks=pytest.mark.verify) for twist in (1, 3))])
+
+@pytest.mark.parametrize(
+    "twist, bins",
+    [
+        (1, NEAR),
+        (3, NEAR),
+        *(pytest.param(twist, FAR, marks=pytest.mark.verify) for twist in (1, 3)),
+    ],
+)
 def test_hits_of_long_rays_lie_on_the_geodesic(rgb, twist, bins):
     """Across the geodesic, to three times the largest error that was measured."""
     limits = LONG_RAYS[twist][:2] if bins == NEAR else LONG_RAYS[twist][2:]
     for (_, high, hits, named_another, _, largest), measured in zip(
-            long_ray_errors(twist, bins), limits):
+        long_ray_errors(twist, bins), limits
+    ):
         assert hits >= 1000
         assert largest <= 3 * measured
         # Things of radius 0.04 against a cone that is 0.005 wide there
         assert named_another <= 0.003 or high > 20
+
 
 @pytest.mark.parametrize("twist", [1, 3])
 def test_a_hit_looked_back_from_sees_the_start_of_its_ray(rgb, twist):
@@ -115,6 +125,7 @@ def test_cells_of_any_size_are_traced_alike(rgb, size):
     assert wrong <= 1e-4
     assert error <= 1.3e-6
 
+
 @pytest.mark.parametrize("distance", [10, 100, 1000, 10_000])
 def test_far_from_the_origin_hits_are_off_by_the_rounding_of_coordinates(rgb, distance):
     """By two to three units of rounding of the scene's coordinates, of which a cell is
@@ -124,6 +135,7 @@ def test_far_from_the_origin_hits_are_off_by_the_rounding_of_coordinates(rgb, di
     assert error <= 1.3e-6 + 8 * step
     assert wrong <= 1e-4 + 6 * step
 
+
 @pytest.mark.parametrize("distance", [10, 100, 1000])
 def test_far_from_the_identity_hits_are_off_by_the_rounding_of_y_times_x(rgb, distance):
     """A height is k x y off by k x times the rounding of y: the square of the distance counts."""
@@ -132,6 +144,7 @@ def test_far_from_the_identity_hits_are_off_by_the_rounding_of_y_times_x(rgb, di
     # Three times what was measured
     assert error <= 5e-6 + 18 * step
     assert wrong <= 2e-4 + 2 * step
+
 
 @pytest.mark.parametrize("distance", ["1e5"])
 def test_rays_end_however_far_from_the_origin(distance):
@@ -143,12 +156,14 @@ def test_rays_end_however_far_from_the_origin(distance):
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=ENVIRONMENT, timeout=30, check=True)
 
+
 @pytest.mark.parametrize("twist", [1e-6, 1e-3, 0.3, 1, -2, 3, 8])
 def test_rays_of_any_twist_meet_the_true_surface(rgb, twist):
     p, v, _ = random_rays(20_000, -1, 1)
     _, _, wrong, unexplained = compare(truth.room_scene(), p, v, twist, False)
     assert len(unexplained) == 0
     assert len(wrong) <= 3  # none of 20,000 is measured
+
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_hits_of_other_methods_are_off_by_their_chords(rgb, name):
@@ -159,6 +174,7 @@ def test_hits_of_other_methods_are_off_by_their_chords(rgb, name):
     (*_, far) = long_ray_errors(1, NEAR, 10_000, make)
     assert far[5] > 2e-4
 
+
 def test_the_printed_form_runs_past_the_walls_along_a_face(rgb):
     """All rays in a face have w = 0, but for those along the fibre, half of the first kind."""
     wrong = [walls_along_faces(axis, 1, TRACERS["printed form"])[0] for axis in range(3)]
@@ -168,6 +184,7 @@ def test_the_printed_form_runs_past_the_walls_along_a_face(rgb):
 # ---------------------------------------------------------------------------
 #  Contacts, corners, thin things
 # ---------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("twist", [1, 3])
 @pytest.mark.parametrize("walls", ["one surface", "sheets"])
@@ -183,12 +200,13 @@ def test_a_closed_room_lit_from_outside_stays_black(rgb, walls, twist):
 def test_a_thin_sheet_is_met_from_the_side_that_a_ray_comes_from(rgb):
     wrong, hits = sheet_rays()
     assert hits > 5000
-    assert wrong <= 3   # none is measured
+    assert wrong <= 3  # none is measured
 
 
 def test_rays_that_start_at_a_contact_or_in_a_corner_meet_the_true_surface(rgb):
     wrong, count = contact_rays()
-    assert wrong <= 5e-4 * count    # 6 in 20,000 are measured, 2e-6 cells off the floor
+    assert wrong <= 5e-4 * count  # 6 in 20,000 are measured, 2e-6 cells off the floor
+
 
 @pytest.mark.parametrize("twist", [1, 2])
 def test_a_closed_box_of_the_quotient_stays_black_inside(rgb, twist):
@@ -198,10 +216,14 @@ def test_a_closed_box_of_the_quotient_stays_black_inside(rgb, twist):
         "box": box([0.2] * 3, [0.8] * 3, PLASTER),
         "point": {"type": "point", "position": [0.9, 0.5, 0.5], "intensity": grey(10.0)},
         "sky": {"type": "constant", "radiance": grey(10.0)},
-        "panel": {"type": "rectangle", "to_world": T.translate([0.5, 0.5, 0.81]).scale(0.3),
-                  "light": lamp(100.0)},
+        "panel": {
+            "type": "rectangle",
+            "to_world": T.translate([0.5, 0.5, 0.81]).scale(0.3),
+            "light": lamp(100.0),
+        },
     }
     assert lit_pixels(scene, twist, True) == 0
+
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_chords_of_other_methods_cut_through_contacts_and_corners(rgb, name):
@@ -231,6 +253,7 @@ def test_needle_triangles_hardly_let_a_ray_through(rgb, twist, tmp_path):
 #  Mirrors and glass
 # ---------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("twist", [0, 1, 2, -1])
 def test_two_mirrors_face_to_face_show_two_hundred_reflections(rgb, twist):
     """Unless a ray is lost or leaks, be it once in 200 bounces."""
@@ -256,13 +279,17 @@ def test_inside_a_glass_ball_no_energy_is_lost_by_total_reflection(rgb, twist):
 #  Beyond the cut point
 # ---------------------------------------------------------------------------
 
+
 def test_further_geodesics_to_random_points_land_on_them(rgb):
     misses = further_misses()
     assert len(misses) > 40_000
     assert misses[len(misses) * 99 // 100] <= 1.5e-5
     # 2e-4 cells from the fibre, where the half turn is no longer told from a whole one
     assert misses[-1] <= 0.01
+
+
 FAR_LIGHT = [0.4, -0.2, 8.0]
+
 
 def test_an_area_light_beyond_the_cut_is_sampled_along_its_shortest_geodesic_only(rgb):
     """Three geodesics join patch and light; emitter sampling takes one, the others are left to
@@ -272,26 +299,35 @@ def test_an_area_light_beyond_the_cut_is_sampled_along_its_shortest_geodesic_onl
     count = 2000
     light = {"type": "sphere", "center": FAR_LIGHT, "radius": 0.01, "light": lamp(1.0)}
     found = lights(1, False, 30.0, light=light).sample(
-        surface(dr.zeros(mi.Point3f, count), mi.Normal3f(0, 0, 1)), independent(count),
-        mi.Bool(True))
+        surface(dr.zeros(mi.Point3f, count), mi.Normal3f(0, 0, 1)),
+        independent(count),
+        mi.Bool(True),
+    )
     assert dr.all(dr.isfinite(found.weight[0]) & dr.isfinite(found.pdf))
     ways.sort(key=lambda way: way[1])
     for i, (direction, _, _) in enumerate(ways):
         cosine = dr.dot(found.direction, mi.Vector3f(*direction))
         assert dr.all((cosine > 0.999) == (i == 0))
 
+
 def test_an_area_light_beyond_the_cut_keeps_its_mean(rgb):
     """With and without emitter sampling, blocks of the image too (0.1 % and 0.14 % to fail)."""
     T = mi.ScalarTransform4f()
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": sensor([0, 0, 1], [0.001, 0, 0], 16),
-        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": grey(0.8)},
-                  "to_world": T.scale(2)},
-        "light": {"type": "sphere", "center": FAR_LIGHT, "radius": 0.6, "light": lamp(20.0)},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor([0, 0, 1], [0.001, 0, 0], 16),
+            "floor": {
+                "type": "rectangle",
+                "bsdf": {"type": "diffuse", "reflectance": grey(0.8)},
+                "to_world": T.scale(2),
+            },
+            "light": {"type": "sphere", "center": FAR_LIGHT, "radius": 0.6, "light": lamp(20.0)},
+        }
+    )
     integrator = {"type": "nil", "quotient": False, "max_depth": 2, "max_distance": 30.0}
     sampled = mi.load_dict(integrator)
     unsampled = without_emitter_sampling(mi.load_dict(integrator))
-    assert_same_expectation(Estimate(scene, sampled, 512, seed=1),
-                            Estimate(scene, unsampled, 2048, seed=2), block=4)
+    assert_same_expectation(
+        Estimate(scene, sampled, 512, seed=1), Estimate(scene, unsampled, 2048, seed=2), block=4
+    )

@@ -35,13 +35,20 @@ def tiles(shapes, columns, samples=8, **scene):
         "sensor": {
             # from above, one unit a tile
             "type": "orthographic",
-            "to_world": mi.ScalarTransform4f().look_at(
-                [columns / 2 - 0.5, rows / 2 - 0.5, 4], [columns / 2 - 0.5, rows / 2 - 0.5, 0],
-                [0, 1, 0]).scale([columns / 2, columns / 2, 1]),
+            "to_world": mi.ScalarTransform4f()
+            .look_at(
+                [columns / 2 - 0.5, rows / 2 - 0.5, 4],
+                [columns / 2 - 0.5, rows / 2 - 0.5, 0],
+                [0, 1, 0],
+            )
+            .scale([columns / 2, columns / 2, 1]),
             "film": film(columns * samples, rows * samples),
         },
-        "floor": {"type": "rectangle", "to_world": place(columns / 2, rows / 2, -0.6, 20),
-                  "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}},
+        "floor": {
+            "type": "rectangle",
+            "to_world": place(columns / 2, rows / 2, -0.6, 20),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}},
+        },
     }
     for i, shape in enumerate(shapes):
         for j, part in enumerate(shape(place(i % columns, i // columns))):
@@ -50,8 +57,11 @@ def tiles(shapes, columns, samples=8, **scene):
 
 
 def environment():
-    return {"type": "envmap", "bitmap": mi.Bitmap(gradient(16, 8)),
-            "to_world": mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 70)}
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(gradient(16, 8)),
+        "to_world": mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 70),
+    }
 
 
 def cornell_box(size, **integrator):
@@ -61,8 +71,11 @@ def cornell_box(size, **integrator):
 
 
 def compare(scene, spp, block=None, **parameters):
-    assert_same_expectation(Estimate(scene, {"type": "path"} | parameters, spp, seed=1),
-                            Estimate(scene, FLAT | parameters, spp, seed=2), block)
+    assert_same_expectation(
+        Estimate(scene, {"type": "path"} | parameters, spp, seed=1),
+        Estimate(scene, FLAT | parameters, spp, seed=2),
+        block,
+    )
 
 
 # ------------------------------------------------------------------ scenes
@@ -85,24 +98,35 @@ def test_flat_cornell_box_has_the_expectation_of_path_with_many_samples(rgb):
 
 def test_flat_scene_file_has_the_expectation_of_path(rgb, data):
     """Fails on equal expectations for one seed in 400."""
-    scene = mi.load_file(str(data / "scenes/cornell-box/scene.xml"), integrator="path", resx=64,
-                         resy=64, max_depth=8)
+    scene = mi.load_file(
+        str(data / "scenes/cornell-box/scene.xml"), integrator="path", resx=64, resy=64, max_depth=8
+    )
     # Its reconstruction filter couples pixels, which leaves their Z-test valid.
     compare(scene, spp=256, block=8, max_depth=8)
 
 
 def test_flat_environment_map_has_the_expectation_of_path(rgb):
     """Fails on equal expectations for one seed in 400."""
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "perspective", "fov": 60, "film": film(64, 64),
-                   "to_world": mi.ScalarTransform4f().look_at([3, 1, 1], [0, 0, 0], [0, 0, 1])},
-        "floor": {"type": "disk", "to_world": place(0, 0, -1, 2)},
-        "ball": {"type": "sphere"},
-        "mirror": {"type": "sphere", "center": [0, 1.6, 0], "radius": 0.5,
-                   "bsdf": {"type": "conductor"}},
-        "sky": environment(),
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 60,
+                "film": film(64, 64),
+                "to_world": mi.ScalarTransform4f().look_at([3, 1, 1], [0, 0, 0], [0, 0, 1]),
+            },
+            "floor": {"type": "disk", "to_world": place(0, 0, -1, 2)},
+            "ball": {"type": "sphere"},
+            "mirror": {
+                "type": "sphere",
+                "center": [0, 1.6, 0],
+                "radius": 0.5,
+                "bsdf": {"type": "conductor"},
+            },
+            "sky": environment(),
+        }
+    )
     compare(scene, spp=256, block=8, max_depth=5)
 
 
@@ -120,44 +144,69 @@ def shapes(folder):
     upright = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 50)
 
     def mesh(kind, file, bsdf=red):
-        return lambda to_world: [{"type": kind, "filename": file, "bsdf": bsdf,
-                                  "to_world": to_world @ small}]
+        return lambda to_world: [
+            {"type": kind, "filename": file, "bsdf": bsdf, "to_world": to_world @ small}
+        ]
 
     def simple(kind, **more):
-        return lambda to_world: [
-            {"type": kind, "to_world": to_world @ upright, "bsdf": red} | more]
+        return lambda to_world: [{"type": kind, "to_world": to_world @ upright, "bsdf": red} | more]
 
     colours = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
     patches = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}}
     curve = write_curve(folder / "curve.txt")
     ply = write_ply(folder / "a.ply")
-    ball = [[[math.sqrt((x - 3.5) ** 2 + (y - 3.5) ** 2 + 2 * (z - 3.5) ** 2) / 8 - 0.3
-              for x in range(8)] for y in range(8)] for z in range(8)]
+    ball = [
+        [
+            [
+                math.sqrt((x - 3.5) ** 2 + (y - 3.5) ** 2 + 2 * (z - 3.5) ** 2) / 8 - 0.3
+                for x in range(8)
+            ]
+            for y in range(8)
+        ]
+        for z in range(8)
+    ]
     ball = mi.TensorXf([v for plane in ball for row in plane for v in row], shape=(8, 8, 8, 1))
     centred = mi.ScalarTransform4f().scale(2).translate([-0.5, -0.5, -0.5])
 
     def instances(to_world):
-        group = {"type": "shapegroup", "a": {"type": "sphere", "radius": 0.6, "bsdf": red},
-                 "b": {"type": "ply", "filename": ply, "to_world": small, "bsdf": patches}}
+        group = {
+            "type": "shapegroup",
+            "a": {"type": "sphere", "radius": 0.6, "bsdf": red},
+            "b": {"type": "ply", "filename": ply, "to_world": small, "bsdf": patches},
+        }
         loaded = mi.load_dict(group)
-        sheared = to_world @ mi.ScalarTransform4f([[1, 0.4, 0, 0], [0, 0.7, 0, 0], [0, 0, 1, 0],
-                                                   [0, 0, 0, 1]])
+        sheared = to_world @ mi.ScalarTransform4f(
+            [[1, 0.4, 0, 0], [0, 0.7, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        )
         return [loaded, {"type": "instance", "shapes": loaded, "to_world": sheared}]
 
     def ellipsoids(to_world):
         centre = to_world @ mi.ScalarPoint3f(0)
         values = [*centre, 0.1, 0.05, 0.14, 0.1, 0.2, 0.3, 0.927]
-        return [{"type": "ellipsoids", "bsdf": {"type": "diffuse"},
-                 "data": mi.TensorXf([float(x) for x in values], shape=(1, 10))}]
+        return [
+            {
+                "type": "ellipsoids",
+                "bsdf": {"type": "diffuse"},
+                "data": mi.TensorXf([float(x) for x in values], shape=(1, 10)),
+            }
+        ]
 
     return [
-        mesh("obj", write_obj(folder / "a.obj")), mesh("ply", ply, colours),
-        mesh("ply", ply, patches), mesh("serialized", write_serialized(folder / "a.serialized")),
-        simple("sphere"), simple("cylinder", p0=[0, 0, -0.6], p1=[0, 0, 0.6], radius=0.7),
-        simple("disk"), simple("rectangle"), simple("cube"), instances,
-        simple("bsplinecurve", filename=curve), simple("linearcurve", filename=curve),
-        lambda to_world: [{"type": "sdfgrid", "grid": ball, "bsdf": red,
-                           "to_world": to_world @ centred}],
+        mesh("obj", write_obj(folder / "a.obj")),
+        mesh("ply", ply, colours),
+        mesh("ply", ply, patches),
+        mesh("serialized", write_serialized(folder / "a.serialized")),
+        simple("sphere"),
+        simple("cylinder", p0=[0, 0, -0.6], p1=[0, 0, 0.6], radius=0.7),
+        simple("disk"),
+        simple("rectangle"),
+        simple("cube"),
+        instances,
+        simple("bsplinecurve", filename=curve),
+        simple("linearcurve", filename=curve),
+        lambda to_world: [
+            {"type": "sdfgrid", "grid": ball, "bsdf": red, "to_world": to_world @ centred}
+        ],
         ellipsoids,
     ]
 
@@ -170,15 +219,17 @@ def test_flat_shapes_of_every_type_have_the_expectation_of_path(rgb, tmp_path):
 
 def bsdfs():
     """Every BSDF plugin that needs no medium."""
+
     def value(*rgb):
         return {"type": "rgb", "value": list(rgb)}
 
     diffuse = {"type": "diffuse", "reflectance": value(0.7, 0.4, 0.2)}
     bumps = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale(6)}
     rough = {"type": "roughconductor", "material": "Au"}
-    normals = mi.TensorXf([c for i in range(64)
-                           for c in (0.5 + 0.2 * math.sin(i), 0.5 + 0.2 * math.cos(3 * i), 0.9)],
-                          shape=(8, 8, 3))
+    normals = mi.TensorXf(
+        [c for i in range(64) for c in (0.5 + 0.2 * math.sin(i), 0.5 + 0.2 * math.cos(3 * i), 0.9)],
+        shape=(8, 8, 3),
+    )
     return {
         "diffuse": diffuse,
         "conductor": {"type": "conductor", "material": "Cu"},
@@ -190,19 +241,36 @@ def bsdfs():
         "roughdielectric": {"type": "roughdielectric", "alpha": 0.2},
         "plastic": {"type": "plastic", "diffuse_reflectance": value(0.1, 0.5, 0.3)},
         "roughplastic": {"type": "roughplastic", "alpha": 0.2, "nonlinear": True},
-        "principled": {"type": "principled", "base_color": value(0.2, 0.5, 0.8), "metallic": 0.5,
-                       "roughness": 0.4, "anisotropic": 0.6, "clearcoat": 0.5, "sheen": 0.3},
-        "principled glass": {"type": "principled", "spec_trans": 0.8, "roughness": 0.3,
-                             "eta": 1.4},
-        "principledthin": {"type": "principledthin", "spec_trans": 0.4, "diff_trans": 0.6,
-                           "roughness": 0.4},
+        "principled": {
+            "type": "principled",
+            "base_color": value(0.2, 0.5, 0.8),
+            "metallic": 0.5,
+            "roughness": 0.4,
+            "anisotropic": 0.6,
+            "clearcoat": 0.5,
+            "sheen": 0.3,
+        },
+        "principled glass": {"type": "principled", "spec_trans": 0.8, "roughness": 0.3, "eta": 1.4},
+        "principledthin": {
+            "type": "principledthin",
+            "spec_trans": 0.4,
+            "diff_trans": 0.6,
+            "roughness": 0.4,
+        },
         "twosided": {"type": "twosided", "a": diffuse, "b": rough},
         "mask": {"type": "mask", "bsdf": diffuse, "opacity": bumps},
         "blendbsdf": {"type": "blendbsdf", "weight": bumps, "a": diffuse, "b": rough},
-        "normalmap": {"type": "normalmap", "bsdf": diffuse,
-                      "normalmap": {"type": "bitmap", "data": normals, "raw": True}},
-        "bumpmap": {"type": "bumpmap", "bsdf": rough | {"alpha": 0.3}, "scale": 0.3,
-                    "texture": texture(to_uv=mi.ScalarTransform4f().scale(3))},
+        "normalmap": {
+            "type": "normalmap",
+            "bsdf": diffuse,
+            "normalmap": {"type": "bitmap", "data": normals, "raw": True},
+        },
+        "bumpmap": {
+            "type": "bumpmap",
+            "bsdf": rough | {"alpha": 0.3},
+            "scale": 0.3,
+            "texture": texture(to_uv=mi.ScalarTransform4f().scale(3)),
+        },
         "null": {"type": "null"},
         "texture": {"type": "diffuse", "reflectance": texture(filter_type="nearest")},
     }
@@ -210,13 +278,20 @@ def bsdfs():
 
 def test_flat_bsdfs_of_every_kind_have_the_expectation_of_path(rgb, tmp_path):
     """Fails on equal expectations for one seed in 400."""
+
     def ball(bsdf):
         tilt = mi.ScalarTransform4f().rotate([0.8, 0.6, 0], 70)
         return lambda to_world: [{"type": "sphere", "to_world": to_world @ tilt, "bsdf": bsdf}]
 
     def fur(to_world):
-        return [{"type": "bsplinecurve", "filename": write_curve(tmp_path / "fur.txt"),
-                 "to_world": to_world, "bsdf": {"type": "hair"}}]
+        return [
+            {
+                "type": "bsplinecurve",
+                "filename": write_curve(tmp_path / "fur.txt"),
+                "to_world": to_world,
+                "bsdf": {"type": "hair"},
+            }
+        ]
 
     scene = tiles([*map(ball, bsdfs().values()), fur], columns=6, samples=12, sky=environment())
     compare(scene, spp=512, block=12, max_depth=6)
@@ -225,17 +300,29 @@ def test_flat_bsdfs_of_every_kind_have_the_expectation_of_path(rgb, tmp_path):
 def test_flat_texture_of_emission_has_the_expectation_of_path(rgb):
     """Area lights whose radiance is a texture, with a BSDF of their own besides, and a plain one.
     Fails on equal expectations for one seed in 400."""
+
     def light(scale=2.0):
         return {"type": "area", "radiance": texture(scale)}
 
     tilt = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 40)
     lights = [
         lambda to_world: [{"type": "rectangle", "to_world": to_world, "light": light()}],
-        lambda to_world: [{"type": "rectangle", "light": light(4.0), "bsdf": {"type": "plastic"},
-                           "to_world": to_world @ tilt}],
+        lambda to_world: [
+            {
+                "type": "rectangle",
+                "light": light(4.0),
+                "bsdf": {"type": "plastic"},
+                "to_world": to_world @ tilt,
+            }
+        ],
         lambda to_world: [{"type": "disk", "to_world": to_world, "light": light()}],
-        lambda to_world: [{"type": "sphere", "to_world": to_world,
-                           "light": {"type": "area", "radiance": {"type": "rgb", "value": 2}}}],
+        lambda to_world: [
+            {
+                "type": "sphere",
+                "to_world": to_world,
+                "light": {"type": "area", "radiance": {"type": "rgb", "value": 2}},
+            }
+        ],
     ]
     compare(tiles(lights, columns=2), spp=256, block=8, max_depth=3)
 
@@ -253,21 +340,37 @@ def hidden_emitters(pixel_format):
             # A mesh: behind a hidden light, `path` takes the distance from the light for that from
             # the camera, and misplaces its hits on shapes that are found by distance.
             {"type": "cube", "to_world": to_world @ tilt},
-            {"type": "disk", "to_world": mi.ScalarTransform4f().translate([0, 0, 1]) @ to_world
-             @ mi.ScalarTransform4f().scale(0.6)} | thing]
-    tile = [behind({"light": lamp}), behind({"bsdf": {"type": "thindielectric"}}),
-            behind({"bsdf": {"type": "mask", "opacity": 0.5, "a": {"type": "diffuse"}}}),
-            behind({"bsdf": {"type": "null"}})]
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "orthographic",
-                   "to_world": mi.ScalarTransform4f().look_at([0.5, 0.5, 4], [0.5, 0.5, 0],
-                                                              [0, 1, 0]),
-                   "film": film(32, 32, pixel_format=pixel_format)},
-        "sky": {"type": "constant"},
-        **{f"{i}_{j}": part for i, shape in enumerate(tile)
-           for j, part in enumerate(shape(place(i % 2, i // 2)))},
-    })
+            {
+                "type": "disk",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 1])
+                @ to_world
+                @ mi.ScalarTransform4f().scale(0.6),
+            }
+            | thing,
+        ]
+
+    tile = [
+        behind({"light": lamp}),
+        behind({"bsdf": {"type": "thindielectric"}}),
+        behind({"bsdf": {"type": "mask", "opacity": 0.5, "a": {"type": "diffuse"}}}),
+        behind({"bsdf": {"type": "null"}}),
+    ]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "orthographic",
+                "to_world": mi.ScalarTransform4f().look_at([0.5, 0.5, 4], [0.5, 0.5, 0], [0, 1, 0]),
+                "film": film(32, 32, pixel_format=pixel_format),
+            },
+            "sky": {"type": "constant"},
+            **{
+                f"{i}_{j}": part
+                for i, shape in enumerate(tile)
+                for j, part in enumerate(shape(place(i % 2, i // 2)))
+            },
+        }
+    )
     return scene
 
 

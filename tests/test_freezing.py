@@ -13,13 +13,15 @@ SENTENCE = 'the integrator "nil" takes numbers from the scene .*: render without
 @pytest.fixture
 def scene(rgb):
     gc.collect()  # Dr.Jit aborts where an earlier test's scene is collected while it records
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "nil", "quotient": False},
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
-        "sky": {"type": "constant"},
-        "ball": {"type": "sphere", "center": [0, 0, 3]},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nil", "quotient": False},
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+            "sky": {"type": "constant"},
+            "ball": {"type": "sphere", "center": [0, 0, 3]},
+        }
+    )
 
 
 def causes(error):

@@ -23,22 +23,30 @@ from benchmarks.studio import (
 def sphere_room():
     return {"room": glowing({"type": "sphere", "flip_normals": True})}
 
+
 def six_walls():
     T = mi.ScalarTransform4f
     turns = [T(), T().rotate([1, 0, 0], 180)]
     turns += [T().rotate(axis, angle) for axis in ([1, 0, 0], [0, 1, 0]) for angle in (90, -90)]
-    return {f"wall{i}": glowing({"type": "rectangle", "to_world": turn @ T().translate([0, 0, -1])})
-            for i, turn in enumerate(turns)}
+    return {
+        f"wall{i}": glowing({"type": "rectangle", "to_world": turn @ T().translate([0, 0, -1])})
+        for i, turn in enumerate(turns)
+    }
+
 
 def furnished_room():
     """A room with things in it that glow as its walls do."""
     T = mi.ScalarTransform4f
     return cube_room() | {
         "ball": glowing({"type": "sphere", "center": [-0.5, 0.4, -0.6], "radius": 0.3}),
-        "box": glowing({"type": "cube",
-                        "to_world": T().translate([0, -0.6, -0.7]).rotate([0, 0, 1], 20)
-                        .scale(0.25)}),
+        "box": glowing(
+            {
+                "type": "cube",
+                "to_world": T().translate([0, -0.6, -0.7]).rotate([0, 0, 1], 20).scale(0.25),
+            }
+        ),
     }
+
 
 class Walls:
     """One mesh of quadrangles that all glow towards the room.
@@ -58,15 +66,18 @@ class Walls:
         normal = [u[i - 2] * v[i - 1] - u[i - 1] * v[i - 2] for i in range(3)]
         front = sum(n * t for n, t in zip(normal, towards)) > 0
         for i, j in ((1, 2), (2, 3)):
-            self.triangles.append((first, first + i, first + j) if front
-                                  else (first, first + j, first + i))
+            self.triangles.append(
+                (first, first + i, first + j) if front else (first, first + j, first + i)
+            )
 
     def save(self, folder):
         file = write_ply(folder / "walls.ply", self.vertices, self.triangles)
         return {"walls": glowing({"type": "ply", "filename": file, "face_normals": True})}
 
+
 # The two ends of an axis: what goes beyond the cube does not exist, and leaves no crack at it.
 ENDS = ((-0.1, 0.48, -1), (0.52, 1.1, 1))
+
 
 def room_across_faces(twist, folder):
     """A room around the cell's faces, edges and corner, between walls in the cell's middle.
@@ -93,6 +104,7 @@ def room_across_faces(twist, folder):
                 walls.add((0, 0, side), at(u0, v0), at(u1, v0), at(u1, v1), at(u0, v1))
     return walls.save(folder)
 
+
 def room_across_y_and_z(_twist, folder):
     """A room around the faces y and z, with walls before the faces x."""
     walls = Walls()
@@ -106,6 +118,7 @@ def room_across_y_and_z(_twist, folder):
     ball = glowing({"type": "sphere", "center": [0.4, 0.2, 0.8], "radius": 0.15})
     return {"ball": ball, **walls.save(folder)}
 
+
 def check_room(scene, integrator, max_depth, spp, seed=0, leaks=0):
     """Each pixel has the exact value, but for at most ``leaks`` of them."""
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
@@ -114,57 +127,87 @@ def check_room(scene, integrator, max_depth, spp, seed=0, leaks=0):
     wrong = dr.count(error > ROUNDING)[0] // 3
     assert wrong <= leaks, f"{wrong} pixels are wrong, by up to {dr.max(error)[0]:.2g}"
 
+
 @pytest.mark.parametrize("room", [cube_room, sphere_room, six_walls, furnished_room])
 @pytest.mark.parametrize("twist", [0, 1, 3, -1])
 def test_closed_room_of_plain_nil_has_the_radiance_of_a_geometric_series(rgb, room, twist):
     """A lost or doubled vertex makes its pixel differ by 1e-4 or more."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]),
-                          **room()})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]), **room()}
+    )
     check_room(scene, nil(twist, False, 8), 8, spp=16)
+
 
 @pytest.mark.parametrize("max_depth", [1, 2, 20])
 def test_radiance_of_a_closed_room_follows_the_number_of_bounces(rgb, max_depth):
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]),
-                          **cube_room()})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]), **cube_room()}
+    )
     check_room(scene, nil(1, False, max_depth), max_depth, spp=4)
+
 
 @pytest.mark.parametrize("cell", [([0.0, 0.0, 0.0], 1.0), ([-3.0, 2.0, 1.0], 2.0)])
 def test_closed_room_does_not_depend_on_the_cell(rgb, cell):
     """Where the group's identity lies and how long its unit is bends the rays, not the sum."""
     origin, size = cell
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]),
-                          **furnished_room()})
-    check_room(scene, nil(1, False, 8, cell_origin=mi.ScalarPoint3f(*origin), cell_size=size), 8,
-               spp=16)
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0]), **furnished_room()}
+    )
+    check_room(
+        scene, nil(1, False, 8, cell_origin=mi.ScalarPoint3f(*origin), cell_size=size), 8, spp=16
+    )
 
-@pytest.mark.parametrize("room, twist", [
-    *[(room_across_faces, twist) for twist in (0, 1, -1)],
-    *[(room_across_y_and_z, twist) for twist in (0, 1, 2)],
-])
-def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(rgb, room, twist,
-                                                                           tmp_path):
+
+@pytest.mark.parametrize(
+    "room, twist",
+    [
+        *[(room_across_faces, twist) for twist in (0, 1, -1)],
+        *[(room_across_y_and_z, twist) for twist in (0, 1, 2)],
+    ],
+)
+def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(
+    rgb, room, twist, tmp_path
+):
     """A lost or doubled vertex makes its pixel differ by 1e-4 or more."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95]),
-                          **room(twist, tmp_path)})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95]),
+            **room(twist, tmp_path),
+        }
+    )
     check_room(scene, nil(twist, True, 8), 8, spp=16)
+
 
 @pytest.mark.parametrize("twist", [0, 1, 2, 3])
 def test_glowing_things_under_an_equally_bright_sky_are_invisible(rgb, twist):
     """In equilibrium each path has the same radiance, wherever it ends and whatever it crosses."""
     things = {
         "a": glowing({"type": "sphere", "center": [0.3, 0.6, 0.4], "radius": 0.25}),
-        "b": glowing({"type": "cube", "to_world": mi.ScalarTransform4f()
-                      .translate([0.5, 0.15, 0.8]).rotate([0, 0, 1], 30).scale(0.1)}),
+        "b": glowing(
+            {
+                "type": "cube",
+                "to_world": mi.ScalarTransform4f()
+                .translate([0.5, 0.15, 0.8])
+                .rotate([0, 0, 1], 30)
+                .scale(0.1),
+            }
+        ),
     }
     equilibrium = EMISSION / (1 - ALBEDO)
-    scene = mi.load_dict({
-        "type": "scene", "sensor": sensor([0.05, 0.05, 0.05], [0.6, 0.5, 0.4]), **things,
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": equilibrium}},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor([0.05, 0.05, 0.05], [0.6, 0.5, 0.4]),
+            **things,
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": equilibrium}},
+        }
+    )
     # 0.8^120 is below a unit in the last place
     image = mi.render(scene, integrator=nil(twist, True, 120), spp=16)
     error = dr.max(dr.abs(image.array / equilibrium - 1))[0]
     assert error <= 3 * ROUNDING
+
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist, quotient", [(1, False), (3, False), (1, True), (2, True)])
@@ -176,8 +219,7 @@ def test_hardly_a_ray_is_lost_at_ten_million_vertices(rgb, twist, quotient, tmp_
     vertices, leaks = 256 * 256 * 16 * 10, 1e-6
     if quotient:
         room = room_across_faces if twist == 1 else room_across_y_and_z
-        scene = {"sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95], 256),
-                 **room(twist, tmp_path)}
+        scene = {"sensor": sensor([0.2, 0.1, 0.9], [0.9, 0.05, 0.95], 256), **room(twist, tmp_path)}
     else:
         scene = {"sensor": sensor([0.3, -0.2, 0.1], [0.9, 0.5, 0], 256), **furnished_room()}
     scene = mi.load_dict({"type": "scene", **scene})
@@ -190,10 +232,13 @@ WHITE = {
     "mirror": {"type": "conductor"},
     "glass": {"type": "dielectric"},
     "thin glass": {"type": "thindielectric"},
-    "twosided": {"type": "twosided",
-                 "a": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}},
+    "twosided": {
+        "type": "twosided",
+        "a": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+    },
     "nothing": {"type": "null"},
 }
+
 
 def white_scene(bsdf, quotient):
     things = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}}}
@@ -212,9 +257,11 @@ def white_scene(bsdf, quotient):
         }
     return mi.load_dict({"type": "scene", **things})
 
+
 @pytest.mark.parametrize("bsdf", WHITE)
-@pytest.mark.parametrize("twist, quotient", [(0, False), (1, False), (3, False), (1, True),
-                                             (2, True)])
+@pytest.mark.parametrize(
+    "twist, quotient", [(0, False), (1, False), (3, False), (1, True), (2, True)]
+)
 def test_white_things_vanish_under_a_white_sky(rgb, bsdf, twist, quotient):
     """Each path brings the sky's radiance, or nothing if ``max_depth`` ends it."""
     scene = white_scene(WHITE[bsdf], quotient)
@@ -229,9 +276,15 @@ def test_white_things_vanish_under_a_white_sky(rgb, bsdf, twist, quotient):
     # through things may meet them again for ever.
     assert dr.count(ended)[0] <= (0.3 if quotient else 0.001) * len(image.array)
 
+
 def test_sky_behind_the_horizon_is_seen_undimmed(rgb):
     """An empty quotient: each ray reaches ``max_distance`` and meets the sky there."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor([0.5, 0.5, 0.5], [1, 0.7, 0.6]),
-                          "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor([0.5, 0.5, 0.5], [1, 0.7, 0.6]),
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.7}},
+        }
+    )
     image = mi.render(scene, integrator=nil(1, True, 3), spp=2)
     assert dr.all(dr.abs(image.array / 0.7 - 1) <= ROUNDING)

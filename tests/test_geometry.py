@@ -15,7 +15,8 @@ from nil_mitsuba import geometry
 
 ARRAYS = [dr.llvm.Array3f, dr.llvm.Array3f64, dr.scalar.Array3f, dr.scalar.Array3f64]
 every_array = pytest.mark.parametrize(
-    "vector_t", ARRAYS, ids=lambda t: t.__module__.split(".")[-1] + "." + t.__name__)
+    "vector_t", ARRAYS, ids=lambda t: t.__module__.split(".")[-1] + "." + t.__name__
+)
 Point = dr.scalar.Array3f64
 
 
@@ -35,6 +36,7 @@ def assert_below(errors, column, bound):
 # ---------------------------------------------------------------------------
 #  Against 30 digits
 # ---------------------------------------------------------------------------
+
 
 @every_array
 @pytest.mark.parametrize("t_max", [5, 20])
@@ -58,8 +60,9 @@ def test_area_density_is_the_jacobian_of_flow(vector_t):
 def test_connect_finds_the_shortest_geodesic_within_its_limits(vector_t):
     cases = reference.connect_cases()
     assert len(cases) >= 300
-    errors = reference.connect_errors(geometry, vector_t, cases,
-                                      reference.ILL_CONDITIONED[is_double(vector_t)])
+    errors = reference.connect_errors(
+        geometry, vector_t, cases, reference.ILL_CONDITIONED[is_double(vector_t)]
+    )
     for column in range(3):
         assert_below(errors, column, limit("connect", vector_t))
     assert_below(errors, 3, limit("area_density", vector_t))
@@ -69,9 +72,13 @@ def test_connect_finds_the_shortest_geodesic_within_its_limits(vector_t):
 @pytest.mark.parametrize("vector_t", ARRAYS[:2], ids=["Array3f", "Array3f64"])
 def test_connect_lands_on_the_point_next_to_the_end_of_the_axis_geodesics(vector_t):
     margin = reference.ILL_CONDITIONED[is_double(vector_t)]
-    cases = [((r, 0, sign * (2*pi + margin * i / 10) / k), k)
-             for r in (0, 1e-12, 1e-7, 1e-5, 1e-4, 1e-3) for i in range(-10, 11)
-             for k in (0.375, 1, 3) for sign in (-1, 1)]
+    cases = [
+        ((r, 0, sign * (2 * pi + margin * i / 10) / k), k)
+        for r in (0, 1e-12, 1e-7, 1e-5, 1e-4, 1e-3)
+        for i in range(-10, 11)
+        for k in (0.375, 1, 3)
+        for sign in (-1, 1)
+    ]
     # More than landing is reached, as ζ − 2π is taken to twice the precision: no margin at all
     errors = reference.connect_errors(geometry, vector_t, cases, 0)
     for column in (0, 1, 2, 4):
@@ -88,9 +95,16 @@ def test_directions_are_as_sharp_after_a_long_way_as_after_a_short_one(vector_t)
 def test_flow_solves_the_geodesic_equation_of_the_metric():
     """A wrong sign or factor in the closed form, which the reference shares, would show here."""
     rng = random.Random(4)
-    rows = [([rng.uniform(-1, 1) for _ in range(3)],
-             reference.unit(rng.gauss(0, 1), rng.gauss(0, 1), w), rng.uniform(1, 6), k)
-            for k in (-3, -1, 0, 0.375, 1, 2) for w in (-0.8, 0, 1e-3, 0.5, 1)]
+    rows = [
+        (
+            [rng.uniform(-1, 1) for _ in range(3)],
+            reference.unit(rng.gauss(0, 1), rng.gauss(0, 1), w),
+            rng.uniform(1, 6),
+            k,
+        )
+        for k in (-3, -1, 0, 0.375, 1, 2)
+        for w in (-0.8, 0, 1e-3, 0.5, 1)
+    ]
     rows, results = reference.evaluate(dr.llvm.Array3f64, geometry.flow, *zip(*rows))
     for row, (end, direction) in zip(rows, results):
         true_end, true_direction = reference.integrate(*row)
@@ -119,12 +133,14 @@ def assert_no_jump(vector_t, function, truth, middle):
     between the sides.
     """
     ulp = 2 * dr.epsilon(vector_t)
-    spacing = ulp * 2**floor(log2(middle))
-    rows, results = reference.evaluate(vector_t, function,
-                                       [middle + i * spacing for i in range(-200, 200)])
-    errors = [[float((value - true) / max(1, abs(true)))
-               for value, true in zip(result, truth(*row))]
-              for row, result in zip(rows, results)]
+    spacing = ulp * 2 ** floor(log2(middle))
+    rows, results = reference.evaluate(
+        vector_t, function, [middle + i * spacing for i in range(-200, 200)]
+    )
+    errors = [
+        [float((value - true) / max(1, abs(true))) for value, true in zip(result, truth(*row))]
+        for row, result in zip(rows, results)
+    ]
     for below, above in zip(zip(*errors[:199]), zip(*errors[201:])):
         assert abs(sum(below) - sum(above)) / len(below) <= 2 * ulp
         assert max(map(abs, below + above)) <= 10 * ulp
@@ -132,7 +148,7 @@ def assert_no_jump(vector_t, function, truth, middle):
 
 @every_array
 def test_flow_and_area_density_do_not_jump_where_their_formula_changes(vector_t):
-    v, k = (0.75, 0.25, -0.625), 1          # exact in either precision; not quite a unit vector
+    v, k = (0.75, 0.25, -0.625), 1  # exact in either precision; not quite a unit vector
     middle = 2 * sqrt(2) / (k * abs(v[2]))  # |k w t/2| = √2
 
     def values(t):
@@ -149,7 +165,7 @@ def test_flow_and_area_density_do_not_jump_where_their_formula_changes(vector_t)
 @every_array
 @pytest.mark.parametrize("r", [0, 0.125, 2, 20])
 def test_connect_does_not_jump_where_it_changes_its_unknown(vector_t, r):
-    middle = pi * (1 + (r/2)**2 / 2)        # ζ at v = π/2
+    middle = pi * (1 + (r / 2) ** 2 / 2)  # ζ at v = π/2
 
     def values(z):
         c = geometry.connect(vector_t(0), vector_t(r, 0, z), 1)
@@ -165,6 +181,7 @@ def test_connect_does_not_jump_where_it_changes_its_unknown(vector_t, r):
 # ---------------------------------------------------------------------------
 #  Special places
 # ---------------------------------------------------------------------------
+
 
 @every_array
 def test_twist_zero_is_euclidean_space(vector_t):
@@ -199,7 +216,7 @@ def test_the_axis_beyond_a_full_turn_is_reached_by_a_circle_of_shorter_geodesics
     tolerance = 4 * dr.epsilon(vector_t)
     # A full turn k w T = 2π, which rises by 2π/k, around a circle, whose area adds the rest
     radius = sqrt((height - 2 * pi / k) / (k * pi))
-    distance = sqrt((2 * pi / k)**2 + (2 * pi * radius)**2)
+    distance = sqrt((2 * pi / k) ** 2 + (2 * pi * radius) ** 2)
     assert distance < height
     assert dr.all(dr.abs(c.distance - distance) <= distance * tolerance)
     assert dr.all(c.direction.x > 0) and dr.all(dr.abs(c.direction.y) <= tolerance)
@@ -218,12 +235,13 @@ def test_area_density_is_signed_beyond_the_caustics(vector_t):
     k, w = 1, 0.75
     lengths = [2 * v / (k * w) for v in (3, 3.3, 4.2, 4.6, 6, 6.5, 7.6, 7.8)]
     rows, results = reference.evaluate(
-        vector_t, lambda t, w: (geometry.area_density(t, w, k),), lengths, [w] * len(lengths))
+        vector_t, lambda t, w: (geometry.area_density(t, w, k),), lengths, [w] * len(lengths)
+    )
     truths = [reference.area_density(t, w, k) for t, w in rows]
     assert min(truths) < 0 < max(truths[1:])
     for (t, _), (area,), true in zip(rows, results, truths):
         # Zeros lie between these lengths: the error is relative to what the terms reach
-        assert abs(area - true) <= limit("area_density", vector_t) * t*t
+        assert abs(area - true) <= limit("area_density", vector_t) * t * t
 
 
 @every_array
@@ -265,8 +283,11 @@ def test_an_opaque_twist_shares_its_kernel():
             dr.kernel_history_clear()
             c = geometry.connect(p, q, twist)
             dr.eval(geometry.flow(p, c.direction, c.distance, twist))
-            return sum(not kernel["cache_hit"] for kernel in dr.kernel_history()
-                       if kernel["type"] == dr.KernelType.JIT)
+            return sum(
+                not kernel["cache_hit"]
+                for kernel in dr.kernel_history()
+                if kernel["type"] == dr.KernelType.JIT
+            )
 
     twists = [dr.opaque(dr.llvm.Float, k) for k in (1, 2, 0)]
     for _ in range(2):  # what a first call leaves behind orders the kernels of all others
@@ -284,8 +305,11 @@ a_point = st.tuples(coordinate, coordinate, coordinate).map(lambda c: Point(*c))
 twist = st.one_of(st.sampled_from([-3.0, -1.0, 0.0, 1e-6, 1e-12, 1.0, 2.0]), st.floats(-3, 3))
 azimuth = st.floats(-pi, pi)
 fibre_component = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-12, -1e-12]), st.floats(-1, 1))
-a_direction = st.builds(lambda f, w: Point(sqrt(1 - w*w) * cos(f), sqrt(1 - w*w) * sin(f), w),
-                        azimuth, fibre_component)
+a_direction = st.builds(
+    lambda f, w: Point(sqrt(1 - w * w) * cos(f), sqrt(1 - w * w) * sin(f), w),
+    azimuth,
+    fibre_component,
+)
 
 
 def close(a, b, tolerance):
@@ -403,17 +427,31 @@ def test_area_density_does_not_depend_on_the_orientation_of_the_fibre(v, t, k):
 #  The unit cell
 # ---------------------------------------------------------------------------
 
+
 def image(g, p, k):
     """g·p in exact arithmetic."""
     g, p = [Fraction(int(i)) for i in g], [Fraction(i) for i in p]
     return [g[0] + p[0], g[1] + p[1], g[2] + p[2] + k * g[0] * p[1]]
 
 
-WRAPPED = [(0, 0, 0), (1, 1, 1), (-1, 0, 0), (0.5, 0.75, 0.25), (1, 0.5, 0.25), (-1, 0.75, 0.25),
-           (-1e-9, 0.5, 0.5), (0.5, -1e-9, 0.5), (0.5, 0.5, -1e-9), (-1e-30, -1e-30, -1e-30),
-           (3, 0.999, -2), (-3, 1e-9, -1e-9), (-7.3, 2.2, 1e-12)] + [
+WRAPPED = [
+    (0, 0, 0),
+    (1, 1, 1),
+    (-1, 0, 0),
+    (0.5, 0.75, 0.25),
+    (1, 0.5, 0.25),
+    (-1, 0.75, 0.25),
+    (-1e-9, 0.5, 0.5),
+    (0.5, -1e-9, 0.5),
+    (0.5, 0.5, -1e-9),
+    (-1e-30, -1e-30, -1e-30),
+    (3, 0.999, -2),
+    (-3, 1e-9, -1e-9),
+    (-7.3, 2.2, 1e-12),
+] + [
     tuple(random.Random(6 + i).uniform(-s, s) for _ in range(3))
-    for i, s in enumerate([1.5, 5, 30, 300, 5000] * 20)]
+    for i, s in enumerate([1.5, 5, 30, 300, 5000] * 20)
+]
 
 
 @every_array
@@ -443,8 +481,9 @@ def test_crossing_one_face_in_x_can_leave_z_on_either_side():
 
 
 @properties
-@given(st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.integers(-9, 9)] * 3),
-       st.integers(-3, 3))
+@given(
+    st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.integers(-9, 9)] * 3), st.integers(-3, 3)
+)
 def test_wrap_does_not_depend_on_the_image_of_a_point(p, h, k):
     inside, g = geometry.wrap(Point(*p), k)
     again, g_again = geometry.wrap(geometry.multiply(Point(*h), inside, k), k)

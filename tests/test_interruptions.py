@@ -59,8 +59,14 @@ def command(still_folder, *arguments, interval=60, **options):
         f"from nil_mitsuba import cli, stills\nstills.CHECKPOINT_SECONDS = {interval}\n"
         "stills.LOOK_SAMPLES = 12 * 12 * 16\ncli.main()"
     )
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=still_folder, text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        cwd=still_folder,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        **options,
+    )
 
 
 def wait_for(path, process, seconds=100):

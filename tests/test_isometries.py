@@ -45,8 +45,13 @@ def photograph(move, things, camera, integrator, folder, spp, seed):
     matrix = [[x[i], y[i], z[i], o[i]] for i in range(3)] + [[0, 0, 0, 1]]
     scene = {
         "type": "scene",
-        "sensor": {"type": "perspective", "fov": 60, "film": film(48, 48), "near_clip": 0.05,
-                   "to_world": mi.ScalarTransform4f(matrix)},
+        "sensor": {
+            "type": "perspective",
+            "fov": 60,
+            "film": film(48, 48),
+            "near_clip": 0.05,
+            "to_world": mi.ScalarTransform4f(matrix),
+        },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
     }
     for i, (vertices, triangles, shine) in enumerate(things):
@@ -72,8 +77,7 @@ def photograph(move, things, camera, integrator, folder, spp, seed):
 
 
 def solid(centre, size):
-    return [tuple(c + size * x for c, x in zip(centre, v)) for v in ICOSAHEDRON], \
-        faces(ICOSAHEDRON)
+    return [tuple(c + size * x for c, x in zip(centre, v)) for v in ICOSAHEDRON], faces(ICOSAHEDRON)
 
 
 def look(direction):
@@ -88,17 +92,27 @@ def look(direction):
 
 
 def plain_scene():
-    floor = ([(-1.0, -1.0, -0.5), (1.0, -1.0, -0.5), (1.0, 1.0, -0.5), (-1.0, 1.0, -0.5)],
-             [(0, 1, 2), (0, 2, 3)])
-    things = [(*solid((0.5, 0.1, 0.2), 0.12), 4), (*solid((0.4, -0.5, -0.2), 0.2), 0),
-              (*solid((-0.1, 0.4, -0.3), 0.15), 0), (*floor, 0)]
+    floor = (
+        [(-1.0, -1.0, -0.5), (1.0, -1.0, -0.5), (1.0, 1.0, -0.5), (-1.0, 1.0, -0.5)],
+        [(0, 1, 2), (0, 2, 3)],
+    )
+    things = [
+        (*solid((0.5, 0.1, 0.2), 0.12), 4),
+        (*solid((0.4, -0.5, -0.2), 0.2), 0),
+        (*solid((-0.1, 0.4, -0.3), 0.15), 0),
+        (*floor, 0),
+    ]
     return things, ((-0.7, -0.1, 0.1), look((1.0, 0.1, -0.15)))
 
 
 def cell_scene():
     # Where each translation below leaves them whole.
-    things = [(*solid((0.26, 0.22, 0.25), 0.06), 3), (*solid((0.65, 0.28, 0.44), 0.05), 0),
-              (*solid((0.33, 0.85, 0.53), 0.05), 0), (*solid((0.87, 0.91, 0.42), 0.04), 0)]
+    things = [
+        (*solid((0.26, 0.22, 0.25), 0.06), 3),
+        (*solid((0.65, 0.28, 0.44), 0.05), 0),
+        (*solid((0.33, 0.85, 0.53), 0.05), 0),
+        (*solid((0.87, 0.91, 0.42), 0.04), 0),
+    ]
     return things, ((0.4, 0.5, 0.4), look((0.7, -0.6, 0.1)))
 
 
@@ -161,8 +175,10 @@ def test_small_twist_continues_twist_zero(rgb, tmp_path):
     """The two take different paths through the code. Fails on equal expectations for one seed in
     400; the expectations differ by far less than the noise."""
     things, camera = plain_scene()
-    images = [photograph(identity(), things, camera, PLAIN | {"twist": twist}, tmp_path, 192, seed)
-              for seed, twist in enumerate((0.0, 1e-4, -1e-4))]
+    images = [
+        photograph(identity(), things, camera, PLAIN | {"twist": twist}, tmp_path, 192, seed)
+        for seed, twist in enumerate((0.0, 1e-4, -1e-4))
+    ]
     assert_same_expectation(images[0], images[1], block=8)
     assert_same_expectation(images[0], images[2], block=8)
 
@@ -170,6 +186,7 @@ def test_small_twist_continues_twist_zero(rgb, tmp_path):
 @pytest.mark.parametrize("twist", [1.0, -2.0, 0.3])
 def test_rotations_about_a_fibre_carry_geodesics_to_geodesics(twist):
     """In the symmetric height z − k x y/2 they are rotations; frame components turn with them."""
+
     def to_symmetric(p):
         return Array3f64(p.x, p.y, p.z - 0.5 * twist * p.x * p.y)
 

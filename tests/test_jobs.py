@@ -37,8 +37,15 @@ def job(tmp_path, rgb):
     """A job whose cell is fitted and whose picture is to be denoised."""
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "triangle.obj").write_text(TRIANGLE)
-    return jobs.Job(str(tmp_path / "scene.xml"), spp=8, pass_spp=4, seed=3, fit=True, denoise=True,
-                    properties={"aovs": "distance", "twist": "2"})
+    return jobs.Job(
+        str(tmp_path / "scene.xml"),
+        spp=8,
+        pass_spp=4,
+        seed=3,
+        fit=True,
+        denoise=True,
+        properties={"aovs": "distance", "twist": "2"},
+    )
 
 
 def test_what_a_job_opens_to_is_what_its_workers_open(job):

@@ -18,25 +18,45 @@ def description(size=16, spp=1, camera=CAMERA, **integrator):
     """A ball, a wall and a glass bead, seen by a camera whose samples stay in their pixels."""
     return {
         "type": "scene",
-        "integrator": {"type": "nil", "cell_origin": list(ORIGIN), "cell_size": SIZE,
-                       "aovs": ", ".join(LAYERS)} | integrator,
+        "integrator": {
+            "type": "nil",
+            "cell_origin": list(ORIGIN),
+            "cell_size": SIZE,
+            "aovs": ", ".join(LAYERS),
+        }
+        | integrator,
         "sensor": {
             "type": "perspective",
             "fov": 70.0,
             "near_clip": 1e-5,  # distances begin there
             "to_world": mi.ScalarTransform4f().look_at(camera, CENTER, [0, 0, 1]),
             "sampler": {"type": "independent", "sample_count": spp},
-            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"},
-                     "component_format": "float32"},
+            "film": {
+                "type": "hdrfilm",
+                "width": size,
+                "height": size,
+                "rfilter": {"type": "box"},
+                "component_format": "float32",
+            },
         },
         "light": {"type": "point", "position": [0.5, 0.5, 1.0]},
-        "ball": {"type": "sphere", "center": CENTER, "radius": RADIUS,
-                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb",
-                                                             "value": [0.7, 0.4, 0.2]}}},
-        "wall": {"type": "rectangle", "bsdf": {"type": "twosided", "nested": {"type": "diffuse"}},
-                 "to_world": mi.ScalarTransform4f().translate([0.8, 0.8, 1.4]).scale(0.5)},
-        "bead": {"type": "sphere", "center": [0.6, 0.8, 0.55], "radius": 0.1,
-                 "bsdf": {"type": "dielectric"}},
+        "ball": {
+            "type": "sphere",
+            "center": CENTER,
+            "radius": RADIUS,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}},
+        },
+        "wall": {
+            "type": "rectangle",
+            "bsdf": {"type": "twosided", "nested": {"type": "diffuse"}},
+            "to_world": mi.ScalarTransform4f().translate([0.8, 0.8, 1.4]).scale(0.5),
+        },
+        "bead": {
+            "type": "sphere",
+            "center": [0.6, 0.8, 0.55],
+            "radius": 0.1,
+            "bsdf": {"type": "dielectric"},
+        },
     }
 
 
@@ -51,7 +71,7 @@ def render(**arguments):
     first = at = channels - len(integrator.aov_names())
     layers = {}
     for layer in integrator.layers:
-        layers[layer] = planes[at:at + len(LAYERS[layer])]
+        layers[layer] = planes[at : at + len(LAYERS[layer])]
         at += len(LAYERS[layer])
     return planes[:first], layers, scene
 
@@ -63,9 +83,7 @@ def in_cells(point):
 @pytest.mark.parametrize(
     "twist, camera", [(0, CAMERA), (1, CAMERA), (-2, CAMERA), (1, (-1.2, 0.4, 2.0))]
 )
-def test_the_distance_is_that_of_the_geodesic_to_the_seen_image_of_the_position(
-    rgb, twist, camera
-):
+def test_the_distance_is_that_of_the_geodesic_to_the_seen_image_of_the_position(rgb, twist, camera):
     _, layers, _ = render(twist=twist, camera=camera, size=64)
     seen = layers["shape"][0] >= 0
     assert dr.count(seen)[0] > 1000
@@ -204,8 +222,10 @@ def test_layers_are_there_in_every_variant(variant):
     try:
         _, layers, scene = render(size=32)
         ball = layers["shape"][0] == numbers_of_shapes(scene)["ball"]
-        mean = [dr.mean(dr.gather(mi.Float, channel, dr.compress(ball)))[0]
-                for channel in layers["albedo"]]
+        mean = [
+            dr.mean(dr.gather(mi.Float, channel, dr.compress(ball)))[0]
+            for channel in layers["albedo"]
+        ]
         if "mono" in variant:
             assert mean == [pytest.approx(luminance, 0.01)] * 3
         else:

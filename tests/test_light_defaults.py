@@ -80,8 +80,12 @@ def emitted(emitter, arrival):
 
 
 def image(width):
-    values = [0.5 + 0.4 * math.sin(0.7 * x + 1.3 * y) for y in range(width) for x in range(width)
-              for _ in range(3)]
+    values = [
+        0.5 + 0.4 * math.sin(0.7 * x + 1.3 * y)
+        for y in range(width)
+        for x in range(width)
+        for _ in range(3)
+    ]
     return {"type": "bitmap", "data": mi.TensorXf(values, shape=(width, width, 3)), "raw": True}
 
 
@@ -130,8 +134,10 @@ def test_a_lamp_shines_by_every_geodesic_however_far_it_is(rgb, place, distance)
                     assert density > 0.02, f"{p}, {q} lie near a caustic"
                     expected += emitted(scene.emitters()[0], arrival) * cosine / density
             mean, deviation, noise = received(scene, nil, p, n, 2**14, seed=7)
-            print(f"{kind} {place} {distance:g} {p}: {len(ways)} ways, {mean:.6g} ± "
-                  f"{deviation:.2g}, expected {expected:.6g}, noise {noise:.2f}")
+            print(
+                f"{kind} {place} {distance:g} {p}: {len(ways)} ways, {mean:.6g} ± "
+                f"{deviation:.2g}, expected {expected:.6g}, noise {noise:.2f}"
+            )
             assert abs(mean - expected) <= POOLED_Z * deviation + 1e-3 * expected
             lit += expected > 0
             if kind == "point":
@@ -163,15 +169,17 @@ def test_no_interval_of_half_turns_that_holds_geodesics_is_left_out(rgb, twist):
                 points.append((2 * R / abs(twist), 0.0, (-1) ** i * factor * zeta / abs(twist)))
                 least.append(count)
     q = columns(points, 1)
-    found = further_intervals(dr.zeros(mi.Point3f, len(points)), q, mi.Float(twist),
-                              mi.Float(math.inf))
+    found = further_intervals(
+        dr.zeros(mi.Point3f, len(points)), q, mi.Float(twist), mi.Float(math.inf)
+    )
     in_excess = [int(f) - count for f, count in zip(found, least)]
     assert min(in_excess) >= 0
     assert max(in_excess) <= 1
     # Nor does a limit of distance leave one out that has geodesics within it
     reach = 40.0 / abs(twist)
-    capped = further_intervals(dr.zeros(mi.Point3f, len(points)), q, mi.Float(twist),
-                               mi.Float(reach))
+    capped = further_intervals(
+        dr.zeros(mi.Point3f, len(points)), q, mi.Float(twist), mi.Float(reach)
+    )
     tried = 0
     for point, count in list(zip(points, capped))[::37]:
         ways = [v for _, t, v in geodesics((0, 0, 0), point, twist, 20.0) if t <= reach]
@@ -191,8 +199,13 @@ def quotient_irradiance(p, n, q, twist, reach):
     return dr.sum(dr.maximum(dr.dot(direction, Array3f64(*n)), 0) / density)[0]
 
 
-@pytest.mark.parametrize("p, n, q", [((0.31, 0.42, 0.17), (0.0, 0.0, 1.0), (0.62, 0.55, 0.71)),
-                                     ((0.05, 0.93, 0.52), (0.36, -0.48, 0.8), (0.9, 0.1, 0.15))])
+@pytest.mark.parametrize(
+    "p, n, q",
+    [
+        ((0.31, 0.42, 0.17), (0.0, 0.0, 1.0), (0.62, 0.55, 0.71)),
+        ((0.05, 0.93, 0.52), (0.36, -0.48, 0.8), (0.9, 0.1, 0.15)),
+    ],
+)
 def test_a_lamp_in_the_cube_shines_from_all_cells_within_the_default_reach(rgb, p, n, q):
     """The quotient as it comes, twist 1, 12 cells: |z| ≤ 3.5 (one sound seed in 2,100 fails), the
     sum being known to 1 %."""
@@ -211,8 +224,14 @@ def test_a_ball_under_a_lamp_some_cells_away_is_as_bright_as_its_geodesics_say(r
     """Rays onto a unit ball, whose radiance by a point light at (4, −4, 1) is ρ/π Σ I cos θ / |A|
     over the geodesics that the ball does not block; fails for one sound seed in 100."""
     ball, q, eye = truth.Sphere((0.0, 0.0, 0.0), 1.0), (4.0, -4.0, 1.0), (0.0, -4.0, 0.0)
-    rays = [(0.0, 1.0, 0.0), (0.05, 1.0, 0.0), (0.0, 1.0, 0.05), (0.0, 1.0, -0.05),
-            (0.1, 1.0, 0.0), (-0.1, 1.0, 0.0)]
+    rays = [
+        (0.0, 1.0, 0.0),
+        (0.05, 1.0, 0.0),
+        (0.0, 1.0, 0.05),
+        (0.0, 1.0, -0.05),
+        (0.1, 1.0, 0.0),
+        (-0.1, 1.0, 0.0),
+    ]
     lit = []
     for ray in rays:
         d = [c / math.hypot(*ray) for c in ray]
@@ -228,15 +247,26 @@ def test_a_ball_under_a_lamp_some_cells_away_is_as_bright_as_its_geodesics_say(r
             blocked = truth.first_hit([ball], start, Array3f64(*direction), t, 1, False)
             if cosine > 0 and blocked.label[0] == truth.NO_SURFACE:
                 expected += 0.5 / math.pi * 10 * cosine / density
-        scene = mi.load_dict({
-            "type": "scene",
-            "ball": {"type": "sphere",
-                     "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
-            "lamp": {"type": "point", "position": list(q),
-                     "intensity": {"type": "rgb", "value": 10.0}},
-            "sensor": {"type": "radiancemeter", "origin": list(eye), "direction": d,
-                       "film": film(1, 1)},
-        })
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "ball": {
+                    "type": "sphere",
+                    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+                },
+                "lamp": {
+                    "type": "point",
+                    "position": list(q),
+                    "intensity": {"type": "rgb", "value": 10.0},
+                },
+                "sensor": {
+                    "type": "radiancemeter",
+                    "origin": list(eye),
+                    "direction": d,
+                    "film": film(1, 1),
+                },
+            }
+        )
         seen = Estimate(scene, integrator(max_depth=2), 1024)
         deviation = math.sqrt(seen.variance[1][0])
         assert abs(seen.mean[1][0] - expected) <= POOLED_Z * deviation + 2e-3 * expected
@@ -247,13 +277,19 @@ def test_a_ball_under_a_lamp_some_cells_away_is_as_bright_as_its_geodesics_say(r
 def ground(**lights):
     """A tilted patch near the origin, seen from close by."""
     T = mi.ScalarTransform4f()
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "perspective", "fov": 40, "film": film(8, 8),
-                   "to_world": T.look_at([0.1, -0.6, 0.9], [0.1, 0.0, 0.0], [0, 0, 1])},
-        "patch": {"type": "rectangle", "to_world": T.rotate([1, 0, 0], 25).scale(0.8)},
-        **lights,
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "film": film(8, 8),
+                "to_world": T.look_at([0.1, -0.6, 0.9], [0.1, 0.0, 0.0], [0, 0, 1]),
+            },
+            "patch": {"type": "rectangle", "to_world": T.rotate([1, 0, 0], 25).scale(0.8)},
+            **lights,
+        }
+    )
 
 
 def glow(shape, distance, place, folder):
@@ -263,18 +299,34 @@ def glow(shape, distance, place, folder):
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.0, 1.0]}}
     size = 0.35 * distance
     if shape == "rectangle":
-        return {"type": "rectangle", "emitter": emitter,
-                "to_world": T.look_at([x, y, z], [0, 0, 0], [0.1, 0.2, 1]).scale(size)}
+        return {
+            "type": "rectangle",
+            "emitter": emitter,
+            "to_world": T.look_at([x, y, z], [0, 0, 0], [0.1, 0.2, 1]).scale(size),
+        }
     if shape == "sphere":
         return {"type": "sphere", "center": [x, y, z], "radius": size, "emitter": emitter}
     # Flat: Mitsuba weighs points on meshes with smooth normals by those, here and in path
-    return {"type": "ply", "filename": write_ply(folder / "lamp.ply"), "emitter": emitter,
-            "face_normals": True, "to_world": T.translate([x, y, z]).scale(0.5 * size)}
+    return {
+        "type": "ply",
+        "filename": write_ply(folder / "lamp.ply"),
+        "emitter": emitter,
+        "face_normals": True,
+        "to_world": T.translate([x, y, z]).scale(0.5 * size),
+    }
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "sphere", "mesh"])
-@pytest.mark.parametrize("distance, place", [(1.0, "oblique"), (4.0, "steep"), (10.0, "steep"),
-                                             (4.0, "horizontal"), (30.0, "beside the fibre")])
+@pytest.mark.parametrize(
+    "distance, place",
+    [
+        (1.0, "oblique"),
+        (4.0, "steep"),
+        (10.0, "steep"),
+        (4.0, "horizontal"),
+        (30.0, "beside the fibre"),
+    ],
+)
 def test_an_area_light_keeps_its_mean_however_far_it_is(rgb, shape, distance, place, tmp_path):
     """With and without emitter sampling; fails for one sound seed in 650."""
     scene = ground(lamp=glow(shape, distance, place, tmp_path))
@@ -289,8 +341,9 @@ def test_a_sky_keeps_its_mean(rgb, sky):
     """With and without emitter sampling; fails for one sound seed in 650."""
     light = {"type": sky}
     if sky == "envmap":
-        light["bitmap"] = mi.Bitmap(mi.TensorXf([0.2 + 0.1 * (i % 17) for i in range(8 * 16 * 3)],
-                                                shape=(8, 16, 3)))
+        light["bitmap"] = mi.Bitmap(
+            mi.TensorXf([0.2 + 0.1 * (i % 17) for i in range(8 * 16 * 3)], shape=(8, 16, 3))
+        )
     scene = ground(sky=light)
     sampled = Estimate(scene, integrator(), 512, seed=1)
     found = Estimate(scene, without_emitter_sampling(integrator()), 1024, seed=2)
@@ -299,9 +352,16 @@ def test_a_sky_keeps_its_mean(rgb, sky):
 
 def test_sunlight_is_its_irradiance_times_the_cosine(rgb):
     """A directional light has the same frame direction everywhere."""
-    scene = mi.load_dict({"type": "scene", "sun": {
-        "type": "directional", "direction": [0.3, -0.5, -0.7],
-        "irradiance": {"type": "rgb", "value": 2.0}}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sun": {
+                "type": "directional",
+                "direction": [0.3, -0.5, -0.7],
+                "irradiance": {"type": "rgb", "value": 2.0},
+            },
+        }
+    )
     length = math.hypot(0.3, 0.5, 0.7)
     for p, n in RECEIVERS:
         cosine = max(0.0, -0.3 * n[0] + 0.5 * n[1] + 0.7 * n[2]) / length

@@ -19,10 +19,18 @@ def turned(place):
 def light(kind, place):
     return {
         "point": {"type": "point", "position": list(place)},
-        "spot": {"type": "spot", "to_world": turned(place), "cutoff_angle": 30.0,
-                 "beam_width": 10.0},
-        "projector": {"type": "projector", "to_world": turned(place), "fov": 50.0,
-                      "irradiance": {"type": "bitmap", "data": gradient(8, 8), "raw": True}},
+        "spot": {
+            "type": "spot",
+            "to_world": turned(place),
+            "cutoff_angle": 30.0,
+            "beam_width": 10.0,
+        },
+        "projector": {
+            "type": "projector",
+            "to_world": turned(place),
+            "fov": 50.0,
+            "irradiance": {"type": "bitmap", "data": gradient(8, 8), "raw": True},
+        },
     }[kind]
 
 
@@ -44,15 +52,29 @@ class Half:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("place, cell", [
-    ((0.0, 0.0, 0.0), 1.0), ((1e5, -2e5, 5e4), 100.0), ((1e6, 2e6, -5e5), 1000.0),
-    ((-3e6, 4e6, 1e3), 1000.0), ((2.0**-13, -(2.0**-14), 2.0**-12), 1e-4)])
+@pytest.mark.parametrize(
+    "place, cell",
+    [
+        ((0.0, 0.0, 0.0), 1.0),
+        ((1e5, -2e5, 5e4), 100.0),
+        ((1e6, 2e6, -5e5), 1000.0),
+        ((-3e6, 4e6, 1e3), 1000.0),
+        ((2.0**-13, -(2.0**-14), 2.0**-12), 1e-4),
+    ],
+)
 def test_a_beam_is_the_same_far_from_the_origin_and_in_small_units(rgb, kind, place, cell):
     """Receivers up to a cell away see, along a line, the intensity that a light at the origin has
     in their direction, to 0.1 % but for the edge of its beam."""
     count = 5000
-    nil = mi.load_dict({"type": "nil", "twist": 0.0, "quotient": False, "cell_size": cell,
-                        "cell_origin": list(place)})
+    nil = mi.load_dict(
+        {
+            "type": "nil",
+            "twist": 0.0,
+            "quotient": False,
+            "cell_size": cell,
+            "cell_origin": list(place),
+        }
+    )
     scene = mi.load_dict({"type": "scene", "lamp": light(kind, place)})
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p = mi.Point3f(*place) + 0.7 * cell * directions(count)
@@ -103,12 +125,22 @@ def lamp(kind, place):
 @pytest.mark.parametrize("kind", [*KINDS, "rectangle", "sphere", "cube"])
 def test_a_light_moved_between_renders_shines_as_one_that_was_always_there(rgb, how, kind):
     """Its place and its size: that of a point drawn on it follows, too."""
+
     def scene(place):
-        return mi.load_dict({
-            "type": "scene", "floor": {"type": "rectangle"}, "lamp": lamp(kind, place),
-            "sensor": {"type": "perspective", "film": film(12, 12), "to_world":
-                       mi.ScalarTransform4f().look_at([0.2, -2, 1.5], [0, 0, 0], [0, 0, 1])},
-        })
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "floor": {"type": "rectangle"},
+                "lamp": lamp(kind, place),
+                "sensor": {
+                    "type": "perspective",
+                    "film": film(12, 12),
+                    "to_world": mi.ScalarTransform4f().look_at(
+                        [0.2, -2, 1.5], [0, 0, 0], [0, 0, 1]
+                    ),
+                },
+            }
+        )
 
     here, there = [0.1, 0.2, 1.0], [0.6, -0.3, 1.4]
     moved, target = scene(here), scene(there)

@@ -60,11 +60,14 @@ def test_irradiance_is_the_cosine_over_area_density(rgb, twist):
     for p, n, q in PATCHES:
         expected = irradiance(p, n, q, twist, reach)
         found = lights(twist, False, reach, lamp=point_light(q, 2.5)).sample(
-            surface(mi.Point3f(*p), mi.Normal3f(*n)), Strata(1), mi.Bool(True))
-        assert received(found, mi.Normal3f(*n))[0] == pytest.approx(2.5 * expected, rel=2e-3,
-                                                                    abs=1e-9), (p, q)
+            surface(mi.Point3f(*p), mi.Normal3f(*n)), Strata(1), mi.Bool(True)
+        )
+        assert received(found, mi.Normal3f(*n))[0] == pytest.approx(
+            2.5 * expected, rel=2e-3, abs=1e-9
+        ), (p, q)
         tried += expected > 0
     assert tried >= 2
+
 
 @pytest.mark.parametrize("twist", [1, 2, 3, -1])
 def test_irradiance_is_summed_over_every_geodesic_that_joins_patch_and_light(rgb, twist):
@@ -75,15 +78,19 @@ def test_irradiance_is_summed_over_every_geodesic_that_joins_patch_and_light(rgb
         expected = irradiance(p, n, q, twist, reach)
         several += len(geodesics(p, q, twist, 0.5 * abs(twist) * reach)) > 1
         found = lights(twist, False, reach, lamp=point_light(q)).sample(
-            surface(columns([p], count), mi.Normal3f(*n)), Strata(count), mi.Bool(True))
+            surface(columns([p], count), mi.Normal3f(*n)), Strata(count), mi.Bool(True)
+        )
         mean = dr.mean(received(found, mi.Normal3f(*n)))[0]
         assert mean == pytest.approx(expected, rel=2e-3, abs=1e-9), (p, q)
     assert several >= len(FAR_PATCHES[twist])
 
+
 def test_light_behind_a_patch_brings_nothing(rgb):
     found = lights(1, False, 6.0, lamp=point_light((0.2, 0.1, -1))).sample(
-        surface(mi.Point3f(0), mi.Normal3f(*UP)), Strata(1), mi.Bool(True))
+        surface(mi.Point3f(0), mi.Normal3f(*UP)), Strata(1), mi.Bool(True)
+    )
     assert received(found, mi.Normal3f(*UP))[0] == 0
+
 
 def test_scene_units_measure_the_intensity(rgb):
     """A cell twice as large at another place: irradiance falls to a quarter, directions stay."""
@@ -92,20 +99,22 @@ def test_scene_units_measure_the_intensity(rgb):
 
     results = []
     for size, origin in ((1.0, (0, 0, 0)), (2.0, (-3, 1, 2))):
+
         def place(p):
             return [o + size * c for o, c in zip(origin, p)]
 
         scene = mi.load_dict({"type": "scene", "lamp": point_light(place((0.7, 0.9, 0.8)))})
         space = Space(1.0, False, list(origin), size)
         found = Lights(scene, space, 6.0).sample(
-            surface(mi.Point3f(*place((0.1, 0.2, 0.3))), mi.Normal3f(*UP)), Strata(1),
-            mi.Bool(True))
+            surface(mi.Point3f(*place((0.1, 0.2, 0.3))), mi.Normal3f(*UP)), Strata(1), mi.Bool(True)
+        )
         results.append((received(found, mi.Normal3f(*UP))[0], found.direction[0][0]))
     assert results[1][0] == pytest.approx(results[0][0] / 4, rel=1e-5)
     assert results[1][1] == pytest.approx(results[0][1], rel=1e-5)
 
 
 # ------------------------------------------------------------------ further geodesics
+
 
 @pytest.mark.parametrize("twist", [1, 2, 3, -1])
 def test_further_geodesics_are_those_of_the_scan(rgb, twist):
@@ -133,8 +142,12 @@ def test_further_geodesics_are_those_of_the_scan(rgb, twist):
         p, q = (columns([pair[i] for pair in pairs], 2) for i in (0, 1))
         second = mi.Bool(dr.arange(mi.UInt32, 2 * len(pairs)) % 2 == 1)
         reached, way = further_geodesic(p, q, mi.Float(twist), mi.Float(m), second)
-        direction, arrival, distance, density = (way.direction, way.arrival, way.distance,
-                                                 way.area_density)
+        direction, arrival, distance, density = (
+            way.direction,
+            way.arrival,
+            way.distance,
+            way.area_density,
+        )
         end, at_end = geometry.flow(p, mi.Vector3f(direction), distance, twist)
         miss = dr.norm(end - q) / (1 + dr.norm(q))
         for i, found in enumerate(expected):
@@ -153,18 +166,23 @@ def test_further_geodesics_are_those_of_the_scan(rgb, twist):
             assert [direction[j][i] for j in range(3)] == pytest.approx(true_direction, abs=3e-4)
             assert miss[i] < 1e-4
             assert [arrival[j][i] for j in range(3)] == pytest.approx(
-                [at_end[j][i] for j in range(3)], abs=3e-4)
+                [at_end[j][i] for j in range(3)], abs=3e-4
+            )
             assert density[i] == pytest.approx(true_density, rel=2e-2)
     assert counts == {(m, second) for m in (1, 2, 3) for second in (0, 1)}
 
 
 # ------------------------------------------------------------------ images
 
-CELL_PAIRS = [((0.31, 0.42, 0.17), UP, (0.62, 0.55, 0.71)),
-              ((0.05, 0.93, 0.52), TILTED, (0.97, 0.11, 0.13))]
+CELL_PAIRS = [
+    ((0.31, 0.42, 0.17), UP, (0.62, 0.55, 0.71)),
+    ((0.05, 0.93, 0.52), TILTED, (0.97, 0.11, 0.13)),
+]
 
-@pytest.mark.parametrize("twist, reach", [(0, 5.0), (0, 12.0), (1, 5.0), (1, 12.0), (2, 3.0),
-                                          (2, 8.0), (-1, 5.0)])
+
+@pytest.mark.parametrize(
+    "twist, reach", [(0, 5.0), (0, 12.0), (1, 5.0), (1, 12.0), (2, 3.0), (2, 8.0), (-1, 5.0)]
+)
 @pytest.mark.parametrize("pair", range(len(CELL_PAIRS)))
 def test_light_in_the_quotient_is_the_sum_over_its_images(rgb, twist, reach, pair):
     """Nothing is cut off: the mean of 2 million samples is the float64 sum over images and
@@ -174,12 +192,14 @@ def test_light_in_the_quotient_is_the_sum_over_its_images(rgb, twist, reach, pai
     assert geodesic_count > 100
     count = 2**21
     found = lights(twist, True, reach, lamp=point_light(q)).sample(
-        surface(columns([p], count), mi.Normal3f(*n)), independent(count, 5), mi.Bool(True))
+        surface(columns([p], count), mi.Normal3f(*n)), independent(count, 5), mi.Bool(True)
+    )
     e = Float64(received(found, mi.Normal3f(*n)))
     mean = dr.mean(e)[0]
     deviation = math.sqrt(dr.mean(dr.square(e - mean))[0] / count)
     assert deviation < 0.01 * expected
     assert abs(mean - expected) <= POOLED_Z * deviation + 2e-5 * expected
+
 
 def chooser(twist, max_distance):
     from nil_mitsuba.lights import Images
@@ -187,17 +207,21 @@ def chooser(twist, max_distance):
 
     return Images(Space(float(twist), True, [0, 0, 0], 1.0), max_distance)
 
-@pytest.mark.parametrize("twist, max_distance", [(0, 5.0), (1, 5.0), (2, 5.0), (3, 3.0), (-1, 5.0),
-                                                 (1, 12.0)])
+
+@pytest.mark.parametrize(
+    "twist, max_distance", [(0, 5.0), (1, 5.0), (2, 5.0), (3, 3.0), (-1, 5.0), (1, 12.0)]
+)
 @pytest.mark.parametrize("pair", range(len(CELL_PAIRS)))
 def test_probabilities_of_all_images_add_up_to_one(rgb, twist, max_distance, pair):
     p, _, q = CELL_PAIRS[pair]
     cells = enough_cells(p, q, twist, math.sqrt(2) * (max_distance + 1))
     g = columns(cells, 1)
     probability = chooser(twist, max_distance).probability(
-        mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(g)))
+        mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(g))
+    )
     assert dr.all(probability >= 0)
     assert dr.sum(Float64(probability))[0] == pytest.approx(1, abs=1e-4)
+
 
 @pytest.mark.parametrize("twist", [0, 1, 2, -1])
 @pytest.mark.parametrize("pair", range(len(CELL_PAIRS)))
@@ -211,8 +235,9 @@ def test_images_are_chosen_as_often_as_their_probability_says(rgb, twist, pair):
     g, told = images.choose(mi.Point3f(*p), mi.Point3f(*q), sampler.next_1d(), sampler.next_2d())
 
     cells = enough_cells(p, q, twist, math.sqrt(2) * (max_distance + 1))
-    probability = images.probability(mi.Point3f(*p), mi.Point3f(*q),
-                                     mi.Vector3i(mi.Point3f(columns(cells, 1))))
+    probability = images.probability(
+        mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(columns(cells, 1)))
+    )
     # Each deck element in a slot of its own
     lowest = [min(c[i] for c in cells) for i in range(3)]
     size = [max(c[i] for c in cells) - lowest[i] + 1 for i in range(3)]
@@ -240,19 +265,25 @@ def test_images_are_chosen_as_often_as_their_probability_says(rgb, twist, pair):
     again = images.probability(mi.Point3f(*p), mi.Point3f(*q), g)
     assert dr.all(dr.abs(again - told) <= 1e-5 * told)
 
+
 @pytest.mark.parametrize("twist, max_distance", [(0, 12.0), (1, 12.0), (2, 12.0), (-1, 5.0)])
 def test_every_image_within_the_distance_can_be_chosen(rgb, twist, max_distance):
     """Also for points on opposite faces of the cell."""
-    for p, q in [((0.31, 0.42, 0.17), (0.62, 0.55, 0.71)), ((0, 0, 0), (1, 1, 0.4)),
-                 ((0.999, 0, 0.5), (0, 0.999, 0.5))]:
+    for p, q in [
+        ((0.31, 0.42, 0.17), (0.62, 0.55, 0.71)),
+        ((0, 0, 0), (1, 1, 0.4)),
+        ((0.999, 0, 0.5), (0, 0.999, 0.5)),
+    ]:
         g, _ = images_within(p, q, twist, max_distance)
         probability = chooser(twist, max_distance).probability(
-            mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(g)))
+            mi.Point3f(*p), mi.Point3f(*q), mi.Vector3i(mi.Point3f(g))
+        )
         assert dr.width(g) > 300
         assert dr.min(probability)[0] > 0
 
 
 # ------------------------------------------------------------------ power and reciprocity
+
 
 def visible(scene, integrator, si, found):
     """Whether nothing stands between the points and the light drawn for them."""
@@ -261,8 +292,9 @@ def visible(scene, integrator, si, found):
 
     active = mi.Bool(found.weight[0] > 0) & (dr.dot(si.n, found.direction) > 0)
     margin = mi.Float(2e-6)  # of a surface that no shape has
-    return active & integrator._visible(View(scene, integrator), si, margin, found, Cone(0, 1e-4),
-                                        active)
+    return active & integrator._visible(
+        View(scene, integrator), si, margin, found, Cone(0, 1e-4), active
+    )
 
 
 @pytest.mark.parametrize("radius", [0.5, 4.0, pytest.param(9.0, marks=pytest.mark.verify)])
@@ -279,11 +311,21 @@ def test_closed_surface_receives_the_whole_power_of_a_light(rgb, radius, twist):
     centre = (0.4, -0.3, 0.2)
     count = 2**18
     reach = 60.0
-    scene = mi.load_dict({"type": "scene", "lamp": point_light(centre),
-                          "wall": {"type": "sphere", "center": list(centre), "radius": radius,
-                                   "flip_normals": True}})
-    integrator = mi.load_dict({"type": "nil", "twist": float(twist), "quotient": False,
-                               "max_distance": reach})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": point_light(centre),
+            "wall": {
+                "type": "sphere",
+                "center": list(centre),
+                "radius": radius,
+                "flip_normals": True,
+            },
+        }
+    )
+    integrator = mi.load_dict(
+        {"type": "nil", "twist": float(twist), "quotient": False, "max_distance": reach}
+    )
     sampler = independent(count, 3)
     i, side = dr.arange(mi.UInt32, count), math.isqrt(count)
     u = (mi.Point2f(i % side, i // side) + sampler.next_2d()) / side
@@ -295,38 +337,56 @@ def test_closed_surface_receives_the_whole_power_of_a_light(rgb, radius, twist):
     conormal = mi.Normal3f(geometry.conormal(p, mi.Normal3f(-outward), twist))
     si = surface(p, dr.normalize(conormal))
     found = Lights(scene, Space(float(twist), False, [0, 0, 0], 1.0), reach).sample(
-        si, sampler, mi.Bool(True))
+        si, sampler, mi.Bool(True)
+    )
     e = dr.select(visible(scene, integrator, si, found), received(found, si.n), 0)
     power = Float64(e * dr.norm(conormal) * s) * (2 * math.pi**2 * radius**2)
     mean = dr.mean(power)[0]
     deviation = math.sqrt(dr.mean(dr.square(power - mean))[0] / count)
-    print(f"radius {radius}, twist {twist}: {mean / (4 * math.pi):.5f} ± "
-          f"{deviation / (4 * math.pi):.5f}")
+    print(
+        f"radius {radius}, twist {twist}: {mean / (4 * math.pi):.5f} ± "
+        f"{deviation / (4 * math.pi):.5f}"
+    )
     assert deviation < 0.005 * 4 * math.pi
     assert abs(mean - 4 * math.pi) <= POOLED_Z * deviation + 2e-3 * 4 * math.pi
 
-@pytest.mark.parametrize("twist, quotient", [
-    (1, False), (0, True), (1, True),
-    *(pytest.param(k, q, marks=pytest.mark.verify) for k, q in ((3, False), (2, True)))])
+
+@pytest.mark.parametrize(
+    "twist, quotient",
+    [
+        (1, False),
+        (0, True),
+        (1, True),
+        *(pytest.param(k, q, marks=pytest.mark.verify) for k, q in ((3, False), (2, True))),
+    ],
+)
 def test_transport_is_the_same_when_light_and_detector_are_swapped(rgb, twist, quotient):
     """Flux from one small rectangle to another, past an obstacle. |z| ≤ 3.5 (fails for one sound
     seed in 2,100), known to 2 %."""
     T = mi.ScalarTransform4f()
-    places = [T.translate([0.31, 0.33, 0.12]).rotate([0.6, 0.8, 0], 25).scale(0.08),
-              T.translate([0.66, 0.58, 0.83]).rotate([0.8, -0.6, 0], 150).scale([0.05, 0.1, 1])]
+    places = [
+        T.translate([0.31, 0.33, 0.12]).rotate([0.6, 0.8, 0], 25).scale(0.08),
+        T.translate([0.66, 0.58, 0.83]).rotate([0.8, -0.6, 0], 150).scale([0.05, 0.1, 1]),
+    ]
     fluxes = []
     for light, detector in ((0, 1), (1, 0)):
-        scene = mi.load_dict({
-            "type": "scene",
-            "light": {"type": "rectangle", "to_world": places[light],
-                      "emitter": {"type": "area"}},
-            "detector": {"type": "rectangle", "to_world": places[detector]},
-            "obstacle": {"type": "sphere", "center": [0.5, 0.4, 0.5], "radius": 0.1},
-        })
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "light": {
+                    "type": "rectangle",
+                    "to_world": places[light],
+                    "emitter": {"type": "area"},
+                },
+                "detector": {"type": "rectangle", "to_world": places[detector]},
+                "obstacle": {"type": "sphere", "center": [0.5, 0.4, 0.5], "radius": 0.1},
+            }
+        )
         fluxes.append(flux(scene, twist, quotient, seed=light))
     (a, da), (b, db) = fluxes
     assert max(da, db) < 0.02 * a
     assert abs(a - b) <= POOLED_Z * math.hypot(da, db)
+
 
 def flux(scene, twist, quotient, seed):
     """Power that the shape "detector" receives through its front, and the standard deviation."""
@@ -351,6 +411,7 @@ def flux(scene, twist, quotient, seed):
 
 # ------------------------------------------------------------------ shadows
 
+
 @pytest.mark.parametrize("twist, quotient", [(1, False), (2, False), (0, True), (1, True)])
 def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, quotient):
     """A fine grid of points on the floor sees the light past two blockers as float64 geodesics do,
@@ -359,21 +420,27 @@ def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, qu
     from nil_mitsuba.quotient import Space
 
     side, lamp = 256, (0.55, 0.45, 0.9)
-    blockers = [truth.Sphere((0.5, 0.5, 0.5), 0.1),
-                truth.Rectangle((0.15, 0.2, 0.3), (0.2, 0.05, 0.02), (0.0, 0.2, 0.05))]
-    scene = mi.load_dict({"type": "scene", "lamp": point_light(lamp),
-                          **truth.to_mitsuba(blockers, mi)})
+    blockers = [
+        truth.Sphere((0.5, 0.5, 0.5), 0.1),
+        truth.Rectangle((0.15, 0.2, 0.3), (0.2, 0.05, 0.02), (0.0, 0.2, 0.05)),
+    ]
+    scene = mi.load_dict(
+        {"type": "scene", "lamp": point_light(lamp), **truth.to_mitsuba(blockers, mi)}
+    )
     i = dr.arange(mi.UInt32, side * side)
-    p = mi.Point3f(0.05 + 0.9 * (i % side + 0.5) / side, 0.05 + 0.9 * (i // side + 0.5) / side,
-                   0.05)
+    p = mi.Point3f(
+        0.05 + 0.9 * (i % side + 0.5) / side, 0.05 + 0.9 * (i // side + 0.5) / side, 0.05
+    )
     si = surface(p, mi.Normal3f(*UP))
     sampler = independent(side * side, 1)
     # Within this distance there is one geodesic to each image.
     reach = 0.999 * 2 * math.pi / max(abs(twist), 1)
-    integrator = mi.load_dict({"type": "nil", "twist": float(twist), "quotient": quotient,
-                               "max_distance": reach})
+    integrator = mi.load_dict(
+        {"type": "nil", "twist": float(twist), "quotient": quotient, "max_distance": reach}
+    )
     found = Lights(scene, Space(float(twist), quotient, [0, 0, 0], 1.0), reach).sample(
-        si, sampler, mi.Bool(True))
+        si, sampler, mi.Bool(True)
+    )
     lit = (found.weight[0] > 0) & (found.direction.z > 0)
     seen = visible(scene, integrator, si, found)
 
@@ -395,6 +462,7 @@ def test_shadow_of_a_point_light_falls_where_the_geodesics_put_it(rgb, twist, qu
 
 # ------------------------------------------------------------------ refusals
 
+
 def test_emitter_without_a_meaning_is_refused_with_a_sentence(rgb):
     class Firefly(mi.Emitter):
         def __init__(self, props):
@@ -408,7 +476,9 @@ def test_emitter_without_a_meaning_is_refused_with_a_sentence(rgb):
     with pytest.raises(RuntimeError, match="has no meaning for the emitter.*use area, point"):
         lights(1, True, 12.0, glow={"type": "firefly"})
 
-@pytest.mark.parametrize("emitter", ["point", "spot", "projector", "directional", "constant",
-                                     "sunsky", "timed_sunsky"])
+
+@pytest.mark.parametrize(
+    "emitter", ["point", "spot", "projector", "directional", "constant", "sunsky", "timed_sunsky"]
+)
 def test_every_other_emitter_of_mitsuba_is_accepted(rgb, emitter):
     assert lights(1, True, 12.0, glow={"type": emitter}).exist

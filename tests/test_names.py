@@ -22,15 +22,21 @@ def obj(file, more=""):
 def test_a_shape_is_named_by_its_id_or_by_type_file_and_place(rgb, tmp_path):
     found = shapes(
         tmp_path,
-        '<bsdf type="diffuse" id="b"/>' + obj("one.obj") + obj("one.obj", 'id="mine"')
+        '<bsdf type="diffuse" id="b"/>'
+        + obj("one.obj")
+        + obj("one.obj", 'id="mine"')
         + '<shape type="sphere"><point name="center" x="1" y="2" z="-.5"/></shape>'
         '<shape type="cube"/>',
         optimize=False,
     )
-    assert sorted(map(name_of, found)) == sorted([
-        'OBJMesh "one.obj" at (0.5, 0.5, 1.4)', '"mine"', "Sphere at (1, 2, -0.5)",
-        "Cube at (0, 0, 0)",
-    ])
+    assert sorted(map(name_of, found)) == sorted(
+        [
+            'OBJMesh "one.obj" at (0.5, 0.5, 1.4)',
+            '"mine"',
+            "Sphere at (1, 2, -0.5)",
+            "Cube at (0, 0, 0)",
+        ]
+    )
 
 
 def test_a_merged_mesh_is_named_by_the_files_it_came_from(rgb, tmp_path):
@@ -46,8 +52,17 @@ def test_a_mesh_of_many_files_has_a_name_that_one_can_read(rgb, tmp_path):
 
 def test_a_warning_names_the_sensor_whose_medium_is_ignored(rgb, capfd):
     fog = {"type": "homogeneous", "sigma_t": 1.0}
-    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "camera": {
-        "type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}, "fog": fog}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant"},
+            "camera": {
+                "type": "perspective",
+                "film": {"type": "hdrfilm", "width": 2, "height": 2},
+                "fog": fog,
+            },
+        }
+    )
     mi.render(scene, integrator=mi.load_dict({"type": "nil"}), spp=1)
     assert 'nil: the medium of the sensor "camera" is ignored.' in capfd.readouterr().out
 

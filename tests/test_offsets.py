@@ -45,10 +45,14 @@ def test_spheres_of_any_size_do_not_shadow_themselves(rgb, radius):
 @pytest.mark.parametrize("scale", [1.0, 0.1, 0.01])
 def test_a_sphere_does_not_shadow_itself_because_an_instance_shrinks_it(rgb, scale, monkeypatch):
     def shrunk(_middle, _size):
-        return {"group": {"type": "shapegroup", "child": {"type": "sphere", "radius": 1 / scale}},
-                "instance": {"type": "instance", "group": {"type": "ref", "id": "group"},
-                             "to_world": mi.ScalarTransform4f().translate([0.3, 0.2, 0.5])
-                             .scale(scale)}}
+        return {
+            "group": {"type": "shapegroup", "child": {"type": "sphere", "radius": 1 / scale}},
+            "instance": {
+                "type": "instance",
+                "group": {"type": "ref", "id": "group"},
+                "to_world": mi.ScalarTransform4f().translate([0.3, 0.2, 0.5]).scale(scale),
+            },
+        }
 
     monkeypatch.setitem(KINDS, "shrunk", shrunk)
     hits = Hits("shrunk", (0.3, 0.2, 0.5), 1.0)
@@ -56,6 +60,7 @@ def test_a_sphere_does_not_shadow_itself_because_an_instance_shrinks_it(rgb, sca
 
 
 # ------------------------------------------------------------------ far from zero
+
 
 def grey(value):
     return {"type": "rgb", "value": value}
@@ -68,16 +73,30 @@ def lit_room(d):
     def at(x, y, z):
         return [x + d, y + d, z + d]
 
-    return mi.load_dict({
-        "type": "scene", "sky": {"type": "constant", "radiance": grey(0.2)},
-        "sensor": {"type": "perspective", "fov": 60, "near_clip": 1e-3, "film": film(48, 48),
-                   "to_world": T.look_at(at(0.1, 0.1, 0.6), at(0.7, 1, 0.4), [0, 0, 1])},
-        "floor": {"type": "rectangle", "to_world": T.translate(at(0.5, 0.5, 0.1)).scale(0.45),
-                  "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}},
-        "ball": {"type": "sphere", "center": at(0.5, 0.6, 0.25), "radius": 0.15},
-        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": grey(5.0)},
-                 "to_world": T.translate(at(0.5, 0.4, 0.9)).rotate([1, 0, 0], 180).scale(0.1)},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant", "radiance": grey(0.2)},
+            "sensor": {
+                "type": "perspective",
+                "fov": 60,
+                "near_clip": 1e-3,
+                "film": film(48, 48),
+                "to_world": T.look_at(at(0.1, 0.1, 0.6), at(0.7, 1, 0.4), [0, 0, 1]),
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": T.translate(at(0.5, 0.5, 0.1)).scale(0.45),
+                "bsdf": {"type": "twosided", "b": {"type": "diffuse"}},
+            },
+            "ball": {"type": "sphere", "center": at(0.5, 0.6, 0.25), "radius": 0.15},
+            "lamp": {
+                "type": "rectangle",
+                "emitter": {"type": "area", "radiance": grey(5.0)},
+                "to_world": T.translate(at(0.5, 0.4, 0.9)).rotate([1, 0, 0], 180).scale(0.1),
+            },
+        }
+    )
 
 
 def assert_same_mean(moved, there, integrators, limit, spp, passes=12):
@@ -85,24 +104,41 @@ def assert_same_mean(moved, there, integrators, limit, spp, passes=12):
     1,000 sound tests), which are at most half of the limit."""
     ratios = []
     for seed in range(passes):
-        means = [dr.mean(mi.render(scene, integrator=integrator, spp=spp, seed=seed).array)[0]
-                 for scene, integrator in zip((moved, there), integrators)]
+        means = [
+            dr.mean(mi.render(scene, integrator=integrator, spp=spp, seed=seed).array)[0]
+            for scene, integrator in zip((moved, there), integrators)
+        ]
         ratios.append(means[0] / means[1] - 1)
     error = statistics.stdev(ratios) / math.sqrt(passes)
     assert error <= 0.5 * limit
     assert abs(statistics.mean(ratios)) <= limit + 3.5 * error
 
 
-@pytest.mark.parametrize("twist, quotient, d, limit, spp", [
-    *((0, False, d, limit, 64) for d, limit in ((1000, 5e-4), (3000, 5e-4), (10_000, 2e-3))),
-    *(pytest.param(1, True, d, limit, 128, marks=pytest.mark.verify)
-      # At 3,000 the rounding of what stands in the cell is a third of 0.28 %
-      for d, limit in ((1000, 2e-3), (3000, 3e-3), (10_000, 1e-2))),
-])
+@pytest.mark.parametrize(
+    "twist, quotient, d, limit, spp",
+    [
+        *((0, False, d, limit, 64) for d, limit in ((1000, 5e-4), (3000, 5e-4), (10_000, 2e-3))),
+        *(
+            pytest.param(1, True, d, limit, 128, marks=pytest.mark.verify)
+            # At 3,000 the rounding of what stands in the cell is a third of 0.28 %
+            for d, limit in ((1000, 2e-3), (3000, 3e-3), (10_000, 1e-2))
+        ),
+    ],
+)
 def test_a_scene_far_from_zero_is_lit_as_at_home(rgb, twist, quotient, d, limit, spp):
     """Everything is moved, and ``cell_origin`` with it."""
-    here, there = (mi.load_dict({"type": "nil", "twist": float(twist), "quotient": quotient,
-                                 "max_depth": 6, "cell_origin": [float(c)] * 3}) for c in (d, 0))
+    here, there = (
+        mi.load_dict(
+            {
+                "type": "nil",
+                "twist": float(twist),
+                "quotient": quotient,
+                "max_depth": 6,
+                "cell_origin": [float(c)] * 3,
+            }
+        )
+        for c in (d, 0)
+    )
     assert_same_mean(lit_room(d), lit_room(0), (here, there), limit, spp)
 
 
@@ -111,20 +147,31 @@ def test_a_lamp_close_to_a_floor_is_as_bright_far_from_zero(rgb):
     T = mi.ScalarTransform4f()
 
     def scene(x, y, z):
-        return mi.load_dict({
-            "type": "scene",
-            "sensor": {"type": "perspective", "fov": 40, "film": film(32, 32), "near_clip": 0.01,
-                       "to_world": T.look_at([x, y - 3, z + 2], [x, y, z], [0, 0, 1])},
-            "floor": {"type": "rectangle", "to_world": T.translate([x, y, z])},
-            "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": grey(5.0)},
-                     "to_world": T.translate([x, y, z + 0.3]).rotate([1, 0, 0], 180).scale(0.1)},
-        })
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 40,
+                    "film": film(32, 32),
+                    "near_clip": 0.01,
+                    "to_world": T.look_at([x, y - 3, z + 2], [x, y, z], [0, 0, 1]),
+                },
+                "floor": {"type": "rectangle", "to_world": T.translate([x, y, z])},
+                "lamp": {
+                    "type": "rectangle",
+                    "emitter": {"type": "area", "radiance": grey(5.0)},
+                    "to_world": T.translate([x, y, z + 0.3]).rotate([1, 0, 0], 180).scale(0.1),
+                },
+            }
+        )
 
     integrator = mi.load_dict({"type": "nil", "twist": 0.0, "quotient": False})
     assert_same_mean(scene(1000, 2000, 500), scene(0, 0, 0), [integrator] * 2, 5e-3, 64)
 
 
 # ------------------------------------------------------------------ mirrors
+
 
 def next_start(view, hit, si, v):
     from nil_mitsuba.interaction import offset
@@ -147,10 +194,15 @@ def test_mirrors_do_not_shift_what_is_seen_in_them(rgb):
     time that it is reflected.
     """
     T = mi.ScalarTransform4f()
-    view = mi.load_dict({"type": "nil", "twist": 0.0, "quotient": False}).view(mi.load_dict({
-        "type": "scene",
-        "below": {"type": "rectangle"},
-        "above": {"type": "rectangle", "to_world": T.translate([0, 0, 1])}}))
+    view = mi.load_dict({"type": "nil", "twist": 0.0, "quotient": False}).view(
+        mi.load_dict(
+            {
+                "type": "scene",
+                "below": {"type": "rectangle"},
+                "above": {"type": "rectangle", "to_world": T.translate([0, 0, 1])},
+            }
+        )
+    )
     slope = mi.Float([0.03, 0.06, 0.09])
     p = mi.Point3f(0 * slope - 0.9, 0, 0.5)
     v = dr.normalize(mi.Vector3f(slope, 0, -1))
@@ -168,37 +220,65 @@ def test_mirrors_do_not_shift_what_is_seen_in_them(rgb):
 HOME, FAR = (0.5, 0.5, 0.1), (1000.0, 2000.0, 500.0)
 
 
-@pytest.mark.parametrize("twist, middle, height, limit", [
-    (0, HOME, 0.3, 1e-5), (1, HOME, 0.3, 1e-4), (0, HOME, 1e-3, 1e-5), (1, HOME, 1e-3, 1e-4),
-    (0, FAR, 3.0, 1e-4), (0, FAR, 0.3, 1e-4),
-    # Twist times offset, 4e-3 cells here, is left out
-    (1, FAR, 0.3, 2e-2)])
+@pytest.mark.parametrize(
+    "twist, middle, height, limit",
+    [
+        (0, HOME, 0.3, 1e-5),
+        (1, HOME, 0.3, 1e-4),
+        (0, HOME, 1e-3, 1e-5),
+        (1, HOME, 1e-3, 1e-4),
+        (0, FAR, 3.0, 1e-4),
+        (0, FAR, 0.3, 1e-4),
+        # Twist times offset, 4e-3 cells here, is left out
+        (1, FAR, 0.3, 2e-2),
+    ],
+)
 def test_light_has_one_density_however_it_was_found(rgb, twist, middle, height, limit):
     """What emitter sampling says of a geodesic to a lamp, and what is said of it when it was found
     by a ray that starts off the surface: relative differences of 99 % of 20,000."""
     T = mi.ScalarTransform4f()
     x, y, z = middle
-    scene = mi.load_dict({
-        "type": "scene",
-        "floor": {"type": "rectangle", "to_world": T.translate([x, y, z]).scale(3 * height)},
-        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": grey(5.0)},
-                 "to_world": T.translate([x, y, z + height]).rotate([1, 0, 0], 180)
-                 .scale(height)}})
-    view = mi.load_dict({"type": "nil", "twist": float(twist), "quotient": False,
-                         "cell_origin": [float(round(c)) for c in middle]}).view(scene)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T.translate([x, y, z]).scale(3 * height)},
+            "lamp": {
+                "type": "rectangle",
+                "emitter": {"type": "area", "radiance": grey(5.0)},
+                "to_world": T.translate([x, y, z + height]).rotate([1, 0, 0], 180).scale(height),
+            },
+        }
+    )
+    view = mi.load_dict(
+        {
+            "type": "nil",
+            "twist": float(twist),
+            "quotient": False,
+            "cell_origin": [float(round(c)) for c in middle],
+        }
+    ).view(scene)
     count = 20_000
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, count)
     p = view.space.to_cells(mi.Point3f(x, y, z + 0.5 * height)) + height * mi.Vector3f(
-        2 * sampler.next_1d() - 1, 2 * sampler.next_1d() - 1, 0)
+        2 * sampler.next_1d() - 1, 2 * sampler.next_1d() - 1, 0
+    )
     hit, si = traced(view, p, mi.Vector3f(0, 0, -1))
     light = view.lights.sample(si, sampler, hit.valid)
     start = next_start(view, hit, si, light.direction)
     found, at_lamp = traced(view, start, light.direction)
     emitter = at_lamp.emitter(scene)
     lit = found.valid & (light.pdf > 0) & (emitter != None)  # noqa: E711
-    pdf = view.lights.pdf(found, at_lamp, emitter, view.space.to_cells(si.p), start,
-                          light.direction, mi.Vector3i(0), lit)
+    pdf = view.lights.pdf(
+        found,
+        at_lamp,
+        emitter,
+        view.space.to_cells(si.p),
+        start,
+        light.direction,
+        mi.Vector3i(0),
+        lit,
+    )
     assert dr.count(lit)[0] > 0.9 * count
     off = sorted(dr.gather(mi.Float, dr.abs(pdf / light.pdf - 1), dr.compress(lit)))
     assert off[len(off) * 99 // 100] <= limit

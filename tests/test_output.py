@@ -55,13 +55,29 @@ def test_a_png_is_srgb(command, folder):
 
 
 def test_layers_are_in_the_file_and_shapes_have_the_numbers_of_the_scene(command, meshes):
-    status, _, err = command("render", "scene.xml", "--spp", "8", "--layers",
-                             "samples,shape, distance,position,normal,albedo,cell")
+    status, _, err = command(
+        "render",
+        "scene.xml",
+        "--spp",
+        "8",
+        "--layers",
+        "samples,shape, distance,position,normal,albedo,cell",
+    )
     assert (status, err) == (0, "")
     header, types, _ = read("scene.exr")
     vectors = [f"{layer}.{c}" for layer in ("cell", "normal", "position") for c in "XYZ"]
-    assert set(types) == {"R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "depth.Z",
-                          "samples.X", "shape.X", *vectors}
+    assert set(types) == {
+        "R",
+        "G",
+        "B",
+        "albedo.R",
+        "albedo.G",
+        "albedo.B",
+        "depth.Z",
+        "samples.X",
+        "shape.X",
+        *vectors,
+    }
     found = planes("scene.exr")
     assert {value for row in found["samples.X"] for value in row} == {8}
     numbers = {value for row in found["shape.X"] for value in row}

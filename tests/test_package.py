@@ -19,8 +19,20 @@ ROOT = Path(__file__).resolve().parents[1]
 def wheel(tmp_path_factory):
     """The project's wheel, built by pip in an environment of its own."""
     folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir",
-                    str(folder), str(ROOT)], check=True)
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--wheel-dir",
+            str(folder),
+            str(ROOT),
+        ],
+        check=True,
+    )
     (path,) = folder.glob("nil_mitsuba-*.whl")
     return path
 
@@ -55,10 +67,14 @@ def test_the_wheel_renders_in_an_empty_environment(wheel, tmp_path):
     home = tmp_path / "environment"
     venv.create(home, with_pip=True)
     scripts = home / ("Scripts" if os.name == "nt" else "bin")
-    clean = {key: value for key, value in os.environ.items()
-             if key not in ("PYTHONPATH", "DRJIT_LIBLLVM_PATH", "VIRTUAL_ENV")}
-    subprocess.run([scripts / "python", "-m", "pip", "install", "--quiet", str(wheel)],
-                   check=True, env=clean)
+    clean = {
+        key: value
+        for key, value in os.environ.items()
+        if key not in ("PYTHONPATH", "DRJIT_LIBLLVM_PATH", "VIRTUAL_ENV")
+    }
+    subprocess.run(
+        [scripts / "python", "-m", "pip", "install", "--quiet", str(wheel)], check=True, env=clean
+    )
     scene = tmp_path / "scene.xml"
     scene.write_text(
         '<scene version="3.0.0"><integrator type="nil"/><emitter type="constant"/>'

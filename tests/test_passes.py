@@ -1,6 +1,5 @@
 """A still is the sum of passes, which follow from the scene and the settings alone."""
 
-
 import drjit as dr
 import mitsuba as mi
 import pytest

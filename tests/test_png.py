@@ -1,6 +1,5 @@
 """PNG files: levels, dithering, the filmic curve."""
 
-
 import drjit as dr
 import mitsuba as mi
 import pytest

@@ -43,25 +43,35 @@ WRONG = [
 @pytest.mark.parametrize("name, value, sentence", WRONG)
 def test_what_a_scene_may_not_say_may_not_be_set_either(nil, name, value, sentence):
     before = str(nil)
-    for how in (lambda: mi.load_dict({"type": "nil", name: value}),
-                lambda: setattr(nil, name, value)):
+    for how in (
+        lambda: mi.load_dict({"type": "nil", name: value}),
+        lambda: setattr(nil, name, value),
+    ):
         with pytest.raises(RuntimeError, match=sentence.replace("?", r"\?")):
             how()
     assert str(nil) == before
 
 
 def test_a_misspelt_property_of_a_scene_file_is_told_with_the_nearest_one(rgb):
-    text = ('<scene version="3.0.0"><integrator type="nil"><integer name="twsit" value="1"/>'
-            "</integrator></scene>")
+    text = (
+        '<scene version="3.0.0"><integrator type="nil"><integer name="twsit" value="1"/>'
+        "</integrator></scene>"
+    )
     with pytest.raises(RuntimeError, match=r'no property "twsit": did you mean "twist"\?$'):
         mi.load_string(text)
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"twist": 3}, {"quotient": False, "twist": 0.5}, {"cell_size": 1.5, "cell_origin": [-.2] * 3},
-     {"max_depth": 2}, {"hide_emitters": True}, {"max_distance": 0.4},
-     {"quotient": False}],
+    [
+        {"twist": 3},
+        {"quotient": False, "twist": 0.5},
+        {"cell_size": 1.5, "cell_origin": [-0.2] * 3},
+        {"max_depth": 2},
+        {"hide_emitters": True},
+        {"max_distance": 0.4},
+        {"quotient": False},
+    ],
     ids=str,
 )
 def test_a_property_that_is_set_is_that_of_the_next_picture(scene, changes):

@@ -26,8 +26,12 @@ TESTED_BY = {
     "examples/light_images.py": "test_examples.py",
     "examples/own_mesh.py": "test_examples.py",
 }
-QUICK = ("benchmarks.camera_rays", "benchmarks.speed", "benchmarks.emitter_sampling",
-         "benchmarks.stills")
+QUICK = (
+    "benchmarks.camera_rays",
+    "benchmarks.speed",
+    "benchmarks.emitter_sampling",
+    "benchmarks.stills",
+)
 
 
 def blocks(*languages):
@@ -45,16 +49,25 @@ def desk(tmp_path_factory):
     """A folder with the README's first scene and links to what its commands read."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(ROOT / "scenes", folder / "scenes")  # pictures are written beside scenes
-    for name in ("examples", "benchmarks", "tests", "nil_mitsuba", "Makefile", "pyproject.toml",
-                 "README.md", "docs"):
+    for name in (
+        "examples",
+        "benchmarks",
+        "tests",
+        "nil_mitsuba",
+        "Makefile",
+        "pyproject.toml",
+        "README.md",
+        "docs",
+    ):
         (folder / name).symlink_to(ROOT / name)
     (folder / "hello.xml").write_text(blocks("xml")[0])
     return folder
 
 
 def run(desk, arguments):
-    result = subprocess.run(arguments, cwd=desk, capture_output=True, text=True, timeout=600,
-                            env=ENVIRONMENT)
+    result = subprocess.run(
+        arguments, cwd=desk, capture_output=True, text=True, timeout=600, env=ENVIRONMENT
+    )
     assert result.returncode == 0, f"{shlex.join(map(str, arguments))}\n{result.stderr[-2000:]}"
 
 
@@ -90,8 +103,9 @@ def run_small(desk, line):
         project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
         extras = re.findall(r"\[([\w,]+)\]", words[-1])
         assert words[0] == "install" and extras
-        assert all(re.search(rf"^{name} = \[", project, re.MULTILINE)
-                   for name in extras[0].split(","))
+        assert all(
+            re.search(rf"^{name} = \[", project, re.MULTILINE) for name in extras[0].split(",")
+        )
     elif program == "nil-mitsuba" and words[0] == "render":
         # Scenes of the project take their size as parameters; the README's own is small
         size = [] if "hello.xml" in words else ["-D", "resx=32", "-D", "resy=18"]

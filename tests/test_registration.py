@@ -167,15 +167,22 @@ def test_rendering_without_writing_leaves_numpy_alone(fresh_python):
 def test_shapes_outside_the_cube_and_media_are_named(rgb, capfd):
     """What is never seen, and what is ignored, is said; nothing is said of what is inside."""
     mi = rgb
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "nil", "max_depth": 1},
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
-        "inside": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.1},
-        "outside": {"type": "sphere", "center": [0.5, 0.5, 0.9], "radius": 0.25},
-        "cloud": {"type": "sphere", "center": [0.2, 0.2, 0.2], "radius": 0.1,
-                  "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nil", "max_depth": 1},
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+            "inside": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.1},
+            "outside": {"type": "sphere", "center": [0.5, 0.5, 0.9], "radius": 0.25},
+            "cloud": {
+                "type": "sphere",
+                "center": [0.2, 0.2, 0.2],
+                "radius": 0.1,
+                "bsdf": {"type": "null"},
+                "interior": {"type": "homogeneous"},
+            },
+        }
+    )
     mi.render(scene, spp=1)
     text = capfd.readouterr().out
     assert '"outside" reaches 0.15 scene units out of the cube' in text

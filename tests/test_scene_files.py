@@ -64,8 +64,9 @@ def test_meshes_includes_and_constants_are_found_from_any_folder(command, folder
             SENSOR,
         )
     )
-    status, _, err = command("render", "a/scene.xml", "-D", "mesh=parts/triangle.obj",
-                             "-D", "spp=16")
+    status, _, err = command(
+        "render", "a/scene.xml", "-D", "mesh=parts/triangle.obj", "-D", "spp=16"
+    )
     assert status == 0, err
     header, _, pixels = read("a/scene.exr")
     assert header["spp"] == 16
@@ -85,8 +86,9 @@ def test_fit_puts_the_scene_into_the_cell(command, folder):
     assert read("scene.exr")[0]["cell_origin"] == corner
 
     # What --fit prints can be typed in.
-    status, _, _ = command("render", "scene.xml", "-P", f"cell_origin={corner}",
-                           "-P", f"cell_size={size!r}")
+    status, _, _ = command(
+        "render", "scene.xml", "-P", f"cell_origin={corner}", "-P", f"cell_size={size!r}"
+    )
     assert (status, read("scene.exr")[0]["cell_origin"]) == (0, corner)
 
 
@@ -98,8 +100,16 @@ def test_fit_needs_something_to_fit(command, folder):
 
 @pytest.mark.parametrize(
     "text, value",
-    [("3", 3), ("-2", -2), ("0.5", 0.5), ("1e-3", 1e-3), ("true", True), ("False", False),
-     ("abc", "abc"), ("1,2", "1,2")],
+    [
+        ("3", 3),
+        ("-2", -2),
+        ("0.5", 0.5),
+        ("1e-3", 1e-3),
+        ("true", True),
+        ("False", False),
+        ("abc", "abc"),
+        ("1,2", "1,2"),
+    ],
 )
 def test_properties_have_the_type_they_look_like(rgb, text, value):
     parsed = scene_files.parse_value(text)

@@ -68,8 +68,9 @@ def test_twist_zero_leaves_a_sensors_rays_as_they_are(rgb, kind):
 def test_cells_scale_the_rays_of_a_sensor(rgb):
     """In a scene ten times as large, with a cell ten times as large, rays are the same in cells."""
     _, p, v, _ = start(sensor("perspective", (0.5, 0.2, 0.1)))
-    _, p2, v2, _ = start(sensor("perspective", (4.0, 3.0, 2.0), near_clip=3.0),
-                         origin=(-1.0, 1.0, 1.0), size=10.0)
+    _, p2, v2, _ = start(
+        sensor("perspective", (4.0, 3.0, 2.0), near_clip=3.0), origin=(-1.0, 1.0, 1.0), size=10.0
+    )
     assert dr.allclose(p, p2, atol=2e-6)
     assert dr.allclose(v, v2, atol=2e-6)
 
@@ -121,20 +122,28 @@ def test_sensor_outside_the_cube_is_carried_into_it(rgb):
     carried = [float(c[0]) for c in geometry.multiply(mi.Point3f(g), mi.Point3f(inside), twist)]
     images = []
     for seed, position in enumerate((inside, carried)):
-        scene = mi.load_dict({
-            "type": "scene", "sky": {"type": "constant"},
-            "sensor": sensor("perspective", position, near_clip=0.01),
-            "a": {"type": "sphere", "center": [0.7, 0.5, 0.5], "radius": 0.15},
-            "b": {"type": "sphere", "center": [0.2, 0.8, 0.2], "radius": 0.1,
-                  "bsdf": {"type": "conductor"}},
-        })
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sky": {"type": "constant"},
+                "sensor": sensor("perspective", position, near_clip=0.01),
+                "a": {"type": "sphere", "center": [0.7, 0.5, 0.5], "radius": 0.15},
+                "b": {
+                    "type": "sphere",
+                    "center": [0.2, 0.8, 0.2],
+                    "radius": 0.1,
+                    "bsdf": {"type": "conductor"},
+                },
+            }
+        )
         integrator = PLAIN | {"quotient": True, "twist": twist, "max_distance": 5.0}
         images.append(Estimate(scene, integrator, 256, seed))
     assert_same_expectation(*images, block=8)
 
 
-@pytest.mark.parametrize("kind, name", [("distant", "DistantSensorImpl"),
-                                        ("irradiancemeter", "IrradianceMeter")])
+@pytest.mark.parametrize(
+    "kind, name", [("distant", "DistantSensorImpl"), ("irradiancemeter", "IrradianceMeter")]
+)
 def test_sensors_without_a_meaning_in_nil_are_refused(rgb, kind, name):
     # One pixel and a wide filter is all that these sensors allow.
     meter = {"type": kind, "film": film(1, 1)}
@@ -153,16 +162,34 @@ def test_sensors_without_a_meaning_in_nil_are_refused(rgb, kind, name):
 
 def glowing_scene(**sensors):
     """Things that shine by themselves, each in its own colour: no noise but at their edges."""
+
     def light(*rgb):
         return {"type": "area", "radiance": {"type": "rgb", "value": list(rgb)}}
 
-    return mi.load_dict({
-        "type": "scene", **sensors,
-        "a": {"type": "sphere", "center": [2, 0.6, -0.4], "radius": 0.5, "light": light(1, 2, 3)},
-        "b": {"type": "rectangle", "to_world": place(3, 1.5, -1.5, 3), "light": light(3, 1, 0.5)},
-        "c": {"type": "cylinder", "p0": [1.6, -0.4, -1], "p1": [1.6, -0.4, 1], "radius": 0.1,
-              "light": light(0.2, 0.8, 0.3)},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            **sensors,
+            "a": {
+                "type": "sphere",
+                "center": [2, 0.6, -0.4],
+                "radius": 0.5,
+                "light": light(1, 2, 3),
+            },
+            "b": {
+                "type": "rectangle",
+                "to_world": place(3, 1.5, -1.5, 3),
+                "light": light(3, 1, 0.5),
+            },
+            "c": {
+                "type": "cylinder",
+                "p0": [1.6, -0.4, -1],
+                "p1": [1.6, -0.4, 1],
+                "radius": 0.1,
+                "light": light(0.2, 0.8, 0.3),
+            },
+        }
+    )
 
 
 def photograph(scene, spp=64, seed=0, sensor=0, **parameters):
@@ -191,8 +218,9 @@ def test_batch_sees_what_its_sensors_see(rgb):
 
 def test_batch_of_sensors_without_a_meaning_is_refused(rgb):
     one = sensor("perspective", (0, 0, 0))
-    scene = glowing_scene(batch={"type": "batch", "a": one, "b": sensor("thinlens", (0, 0, 0)),
-                                 "film": film(48, 24)})
+    scene = glowing_scene(
+        batch={"type": "batch", "a": one, "b": sensor("thinlens", (0, 0, 0)), "film": film(48, 24)}
+    )
     with pytest.raises(RuntimeError, match="render it as a sensor of its own"):
         mi.load_dict(PLAIN).render(scene, spp=1)
 
@@ -202,8 +230,9 @@ def test_radiancemeter_measures_one_geodesic(rgb):
     scene = glowing_scene(meter=sensor("radiancemeter", (0, 0, 0)))
     value = photograph(scene, spp=4)
     assert value.shape == (1, 1, 3)
-    narrow = glowing_scene(camera=sensor("perspective", (0, 0, 0), fov=0.01, near_clip=0.01,
-                                         film=film(1, 1)))
+    narrow = glowing_scene(
+        camera=sensor("perspective", (0, 0, 0), fov=0.01, near_clip=0.01, film=film(1, 1))
+    )
     assert dr.allclose(value, photograph(narrow, spp=4), rtol=1e-4)
     assert dr.max(value.array)[0] > 0
 
@@ -218,25 +247,33 @@ def test_crop_shows_its_part_of_the_image(rgb):
     assert dr.mean(difference)[0] <= 0.02
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian", "tent", "mitchell", "catmullrom",
-                                     "lanczos"])
+@pytest.mark.parametrize(
+    "rfilter", ["box", "gaussian", "tent", "mitchell", "catmullrom", "lanczos"]
+)
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_filters_work_as_in_path(rgb, rfilter, border):
     """With twist 0, from the same film. Within 5 deviations of an edge of contrast 3 at 256
     samples, or less by smoothing; negative lobes add up to a third."""
-    scene = glowing_scene(s=sensor("perspective", (0, 0, 0), film=film(
-        24, 24, rfilter={"type": rfilter}, sample_border=border)))
+    scene = glowing_scene(
+        s=sensor(
+            "perspective",
+            (0, 0, 0),
+            film=film(24, 24, rfilter={"type": rfilter}, sample_border=border),
+        )
+    )
     mine = photograph(scene, spp=256, seed=1, twist=0.0)
-    theirs = mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=256,
-                       seed=2)
+    theirs = mi.render(
+        scene, integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=256, seed=2
+    )
     assert mine.shape == theirs.shape
     difference = mine.array - theirs.array
     assert dr.max(dr.abs(difference))[0] <= 5 * 1.5 * (2 / 256) ** 0.5 * 4 / 3
     assert abs(dr.mean(difference)[0]) <= 0.005
 
 
-@pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "orthogonal",
-                                     "ldsampler"])
+@pytest.mark.parametrize(
+    "sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+)
 def test_every_sampler_gives_the_same_image(rgb, sampler):
     """25 samples a pixel are asked for, and each sampler rounds them to what it can do."""
     camera = sensor("perspective", (0, 0, 0), sampler={"type": sampler, "sample_count": 25})
@@ -247,8 +284,9 @@ def test_every_sampler_gives_the_same_image(rgb, sampler):
 
 
 def test_each_sensor_of_a_scene_takes_its_own_image(rgb):
-    cameras = {f"s{i}": sensor("perspective", (0, 0.2 * i, 0), film=film(8 + i, 8))
-               for i in range(3)}
+    cameras = {
+        f"s{i}": sensor("perspective", (0, 0.2 * i, 0), film=film(8 + i, 8)) for i in range(3)
+    }
     scene = glowing_scene(**cameras)
     images = [photograph(scene, spp=16, sensor=i) for i in range(3)]
     assert [image.shape for image in images] == [(8, 8 + i, 3) for i in range(3)]
@@ -262,7 +300,7 @@ def test_passes_make_the_image_of_all_their_samples(rgb, monkeypatch):
     from nil_mitsuba import passes as module
 
     scene = glowing_scene(s=sensor("perspective", (0, 0, 0)))
-    exact = photograph(scene, spp=1024)    # in one pass
+    exact = photograph(scene, spp=1024)  # in one pass
     monkeypatch.setattr(module, "WAVEFRONT_SAMPLES", 24 * 24 * 10)
     passes = module.Passes(integrator, scene, spp=64)
     assert (passes.count, passes.spp) == (7, 10)

@@ -22,8 +22,11 @@ def surfaces(folder):
         "sphere": {"type": "sphere", "to_world": turn},
         "ply": {"type": "ply", "filename": write_ply(folder / "a.ply"), "to_world": turn},
         "cylinder": {"type": "cylinder", "to_world": turn},
-        "mirrored": {"type": "cube", "bsdf": bumps,
-                     "to_world": turn @ mi.ScalarTransform4f().scale([-1, 1.3, 0.8])},
+        "mirrored": {
+            "type": "cube",
+            "bsdf": bumps,
+            "to_world": turn @ mi.ScalarTransform4f().scale([-1, 1.3, 0.8]),
+        },
         "rectangle": {"type": "rectangle", "to_world": turn},
     }
 
@@ -111,11 +114,13 @@ def test_normal_is_the_gradient_of_distance_to_the_surface(rgb, twist):
         return dr.squared_norm(q - mi.Point3f(1.2, -0.7, 0.4))
 
     step = 1e-2
-    gradient = mi.Vector3f(*(
-        level(mi.Point3f(geometry.flow(p, mi.Vector3f(*axis), step, twist)[0]))
-        - level(mi.Point3f(geometry.flow(p, mi.Vector3f(*axis), -step, twist)[0]))
-        for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-    ))
+    gradient = mi.Vector3f(
+        *(
+            level(mi.Point3f(geometry.flow(p, mi.Vector3f(*axis), step, twist)[0]))
+            - level(mi.Point3f(geometry.flow(p, mi.Vector3f(*axis), -step, twist)[0]))
+            for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+        )
+    )
     assert dr.all(~hit.valid | (dr.norm(dr.normalize(gradient) - si.n) < 1e-3))
 
 
@@ -168,23 +173,43 @@ def test_offset_leaves_the_surface_on_the_side_of_the_direction(rgb, twist, cell
 @pytest.mark.parametrize("twist, quotient", [(1.0, False), (3.0, False), (1.0, True)])
 def test_emission_follows_the_texture_of_the_point_that_is_hit(rgb, twist, quotient):
     """A texture whose value is its own u and v, seen along single geodesics."""
-    values = [c for y in range(64) for x in range(64)
-              for c in ((x + 0.5) / 64, (y + 0.5) / 64, 0.25)]
-    ramp = {"type": "bitmap", "raw": True, "wrap_mode": "clamp",
-            "data": mi.TensorXf(values, shape=(64, 64, 3))}
-    ball = {"type": "sphere", "center": [0.6, 0.5, 0.4], "radius": 0.3,
-            "light": {"type": "area", "radiance": ramp}}
-    scene = mi.load_dict({
-        "type": "scene", "ball": ball,
-        "sensor": {"type": "perspective", "fov": 1, "film": film(2, 2), "near_clip": 1e-3,
-                   "to_world": mi.ScalarTransform4f().look_at([0.05, 0.3, 0.4], [0.6, 0.5, 0.4],
-                                                              [0, 0, 1])},
-    })
+    values = [
+        c for y in range(64) for x in range(64) for c in ((x + 0.5) / 64, (y + 0.5) / 64, 0.25)
+    ]
+    ramp = {
+        "type": "bitmap",
+        "raw": True,
+        "wrap_mode": "clamp",
+        "data": mi.TensorXf(values, shape=(64, 64, 3)),
+    }
+    ball = {
+        "type": "sphere",
+        "center": [0.6, 0.5, 0.4],
+        "radius": 0.3,
+        "light": {"type": "area", "radiance": ramp},
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ball": ball,
+            "sensor": {
+                "type": "perspective",
+                "fov": 1,
+                "film": film(2, 2),
+                "near_clip": 1e-3,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    [0.05, 0.3, 0.4], [0.6, 0.5, 0.4], [0, 0, 1]
+                ),
+            },
+        }
+    )
     integrator = mi.load_dict({"type": "nil", "twist": twist, "quotient": quotient, "max_depth": 1})
     image = mi.render(scene, integrator=integrator, spp=64)
     hit, si = look_at(scene, twist, quotient)
-    middle = [sum(float(image[y, x, c].array[0]) for x in range(2) for y in range(2)) / 4
-              for c in range(3)]
+    middle = [
+        sum(float(image[y, x, c].array[0]) for x in range(2) for y in range(2)) / 4
+        for c in range(3)
+    ]
     assert middle[0] == pytest.approx(float(si.uv.x[0]), abs=0.02)
     assert middle[1] == pytest.approx(float(si.uv.y[0]), abs=0.02)
     assert middle[2] == pytest.approx(0.25, rel=1e-4)
@@ -210,14 +235,23 @@ def look_at(scene, twist, quotient):
 @pytest.mark.parametrize("name", ["vertex_color", "face_color"])
 def test_emission_follows_the_attributes_of_a_mesh(rgb, name, tmp_path):
     """Each pixel shows a value between those of the corners that it sees."""
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": {"type": "perspective", "fov": 40, "film": film(16, 16),
-                   "to_world": mi.ScalarTransform4f().look_at([-3, 0, 0], [0, 0, 0], [0, 0, 1])},
-        "mesh": {"type": "ply", "filename": write_ply(tmp_path / "a.ply"), "to_world": place(0, 0),
-                 "light": {"type": "area",
-                           "radiance": {"type": "mesh_attribute", "name": name}}},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "film": film(16, 16),
+                "to_world": mi.ScalarTransform4f().look_at([-3, 0, 0], [0, 0, 0], [0, 0, 1]),
+            },
+            "mesh": {
+                "type": "ply",
+                "filename": write_ply(tmp_path / "a.ply"),
+                "to_world": place(0, 0),
+                "light": {"type": "area", "radiance": {"type": "mesh_attribute", "name": name}},
+            },
+        }
+    )
     integrator = mi.load_dict({"type": "nil", "twist": 1.0, "quotient": False, "max_depth": 1})
     image = mi.render(scene, integrator=integrator, spp=16)
     red, green, blue = (image[4:12, 4:12, c].array for c in range(3))

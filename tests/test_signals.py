@@ -81,8 +81,11 @@ def test_a_second_signal_ends_the_command_within_three_seconds(rgb, tmp_path, nu
     (tmp_path / "room.xml").write_text(ROOM)
     process = subprocess.Popen(
         [sys.executable, "-c", COMMAND, "render", "room.xml", "--spp", "64", "--pass-spp", "4"],
-        cwd=tmp_path, env=os.environ | {"WHERE": where}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        cwd=tmp_path,
+        env=os.environ | {"WHERE": where},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
     try:
         wait_for(tmp_path / "slow", process)
@@ -98,10 +101,13 @@ def test_a_second_signal_ends_the_command_within_three_seconds(rgb, tmp_path, nu
     assert seconds < 3
     assert (process.returncode, out) == (128 + number, "")
     finishing, interrupted = filter(None, err.splitlines())
-    assert finishing == ("nil-mitsuba: finishing the pass that is being rendered; a second signal "
-                         "ends this at once.")
-    assert interrupted == ("nil-mitsuba: interrupted, no picture was written; the same command "
-                           'with --resume goes on from "room.sums".')
+    assert finishing == (
+        "nil-mitsuba: finishing the pass that is being rendered; a second signal ends this at once."
+    )
+    assert interrupted == (
+        "nil-mitsuba: interrupted, no picture was written; the same command "
+        'with --resume goes on from "room.sums".'
+    )
     assert checkpoint.load(tmp_path / "room.sums").sums.passes == ((0, 1),)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"room.xml", "room.sums", "slow"}
@@ -132,13 +138,15 @@ def test_the_watch_is_over_with_the_command():
 
 @pytest.fixture
 def scene(rgb):
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "nil", "quotient": False},
-        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
-        "sky": {"type": "constant"},
-        "ball": {"type": "sphere", "center": [0, 0, 3]},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nil", "quotient": False},
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+            "sky": {"type": "constant"},
+            "ball": {"type": "sphere", "center": [0, 0, 3]},
+        }
+    )
 
 
 def test_no_render_from_python_is_watched(scene):
@@ -173,7 +181,8 @@ def test_a_signal_from_the_keyboard_arrives_between_wavefronts(scene, monkeypatc
 
 def test_a_signal_while_loops_are_recorded_is_no_error_of_theirs(scene, monkeypatch):
     module = sys.modules["nil_mitsuba.integrator"]
-    monkeypatch.setattr(module, "surface_interaction",
-                        lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(
+        module, "surface_interaction", lambda *_: os.kill(os.getpid(), signal.SIGINT)
+    )
     with pytest.raises(KeyboardInterrupt):
         scene.integrator().render(scene, spp=4)

@@ -40,15 +40,14 @@ def test_time_left_is_that_of_the_nearest_rule():
     def left(samples, seconds, noise, rules=rules):
         return stills.Progress(1, samples, seconds, noise, rules).left
 
-    assert left(100, 10.0, 0.4) == 30    # samples: three times as long again
-    assert left(10, 10.0, 1.0) == 40     # time
+    assert left(100, 10.0, 0.4) == 30  # samples: three times as long again
+    assert left(10, 10.0, 1.0) == 40  # time
     assert left(100, 10.0, 0.15) == pytest.approx(12.5)  # 10 (1.5² − 1)
     assert left(0, 0.0, None, stills.Rules(spp=3)) is None
     assert left(100, 10.0, 0.15, stills.Rules(noise=1e-200)) == math.inf
 
 
-@pytest.mark.parametrize("rfilter", [
-    "box", pytest.param("gaussian", marks=pytest.mark.verify)])
+@pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.verify)])
 def test_noise_is_the_error_that_there_is(rgb, rfilter):
     # Means over 24 renders of squared errors and of squared estimates; sound estimates fail for
     # |z| > 3.5 once in 2,100 runs.
@@ -117,11 +116,21 @@ def test_the_shortest_time_is_that_of_one_pass(small):
 
 @pytest.mark.parametrize(
     "wrong, fragment",
-    [({"spp": 0}, "spp"), ({"spp": 1.5}, "spp"), ({"seconds": 0}, "seconds"),
-     ({"noise": -1}, "noise"), ({"noise": math.nan}, "noise"), ({"seconds": math.inf}, "seconds"),
-     ({"spp": math.nan}, "spp"), ({"spp": math.inf}, "spp"), ({"noise": "0.1"}, "noise"),
-     ({"seed": -1}, "seed"), ({"seed": 2**32}, "seed"), ({"sensor": 1}, "1 sensors"),
-     ({"sensor": -1}, "1 sensors")],
+    [
+        ({"spp": 0}, "spp"),
+        ({"spp": 1.5}, "spp"),
+        ({"seconds": 0}, "seconds"),
+        ({"noise": -1}, "noise"),
+        ({"noise": math.nan}, "noise"),
+        ({"seconds": math.inf}, "seconds"),
+        ({"spp": math.nan}, "spp"),
+        ({"spp": math.inf}, "spp"),
+        ({"noise": "0.1"}, "noise"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 2**32}, "seed"),
+        ({"sensor": 1}, "1 sensors"),
+        ({"sensor": -1}, "1 sensors"),
+    ],
 )
 def test_rules_that_mean_nothing_are_refused(small, wrong, fragment):
     with pytest.raises(ValueError, match=fragment):
@@ -133,8 +142,9 @@ def test_a_resumed_still_is_the_uninterrupted_one(small, tmp_path):
     whole = nil_mitsuba.render(small, spp=96, noise=1e-9, seed=2)
     nil_mitsuba.render(small, spp=32, noise=1e-9, seed=2, checkpoint=path)
     again = []
-    image = nil_mitsuba.render(small, spp=96, noise=1e-9, seed=2, checkpoint=path, resume=True,
-                               progress=again.append)
+    image = nil_mitsuba.render(
+        small, spp=96, noise=1e-9, seed=2, checkpoint=path, resume=True, progress=again.append
+    )
     assert [r.samples for r in again] == [32, 48, 64, 80, 96]
     assert equal(image, whole)
 
@@ -176,8 +186,12 @@ def test_whole_numbers_may_be_of_any_kind(small, tmp_path):
 
 @pytest.mark.parametrize(
     "passes, count, gaps",
-    [(((0, 4),), 4, []), (((1, 2), (3, 4)), 6, [(0, 1), (2, 3), (4, 6)]), ((), 2, [(0, 2)]),
-     (((0, 8),), 4, [])],
+    [
+        (((0, 4),), 4, []),
+        (((1, 2), (3, 4)), 6, [(0, 1), (2, 3), (4, 6)]),
+        ((), 2, [(0, 2)]),
+        (((0, 8),), 4, []),
+    ],
 )
 def test_missing_passes_are_named(small, passes, count, gaps):
     state = still_of(small).nothing()
@@ -209,11 +223,28 @@ def test_full_hd_stays_below_4_gibibytes(still_folder):
     sizes = []
     for spp in ("2", "6"):  # the second pass meets the sums of the first
         run = subprocess.run(
-            [sys.executable, "-c", code, "render", str(ROOT / "scenes" / "cornell-box.xml"),
-             "-D", "resx=1920", "-D", "resy=1080", "-P", "max_depth=2", "--spp", spp,
-             "-o", str(still_folder / "a.exr"),
-             "--layers", "distance,position,normal,albedo,cell,shape,samples"],
-            capture_output=True, text=True, timeout=600,
+            [
+                sys.executable,
+                "-c",
+                code,
+                "render",
+                str(ROOT / "scenes" / "cornell-box.xml"),
+                "-D",
+                "resx=1920",
+                "-D",
+                "resy=1080",
+                "-P",
+                "max_depth=2",
+                "--spp",
+                spp,
+                "-o",
+                str(still_folder / "a.exr"),
+                "--layers",
+                "distance,position,normal,albedo,cell,shape,samples",
+            ],
+            capture_output=True,
+            text=True,
+            timeout=600,
         )
         assert run.returncode == 0, run.stderr
         sizes.append(int(run.stdout.split()[-1]))  # KiB

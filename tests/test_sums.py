@@ -1,6 +1,5 @@
 """Sums of passes: in any order, of any number, none twice."""
 
-
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -13,9 +12,12 @@ def test_sums_of_more_than_2_to_the_32_samples_lose_nothing(small):
     still = still_of(small, spp=2**34)
     state = sums_of(still, 0)
     many = 2**33 // 16
-    far = checkpoint.Checkpoint(state.settings, type(state.sums)(
-        state.sums.values * many, state.sums.moments * many, state.sums.points, ((0, many),)
-    ))
+    far = checkpoint.Checkpoint(
+        state.settings,
+        type(state.sums)(
+            state.sums.values * many, state.sums.moments * many, state.sums.points, ((0, many),)
+        ),
+    )
     index = next(still.todo(far))
     assert index == many
     more = far.plus(still.render(index))

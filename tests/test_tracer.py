@@ -10,8 +10,10 @@ from benchmarks.camera_rays import compare
 # the part of their allowance by which hits are off
 LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 1.0)}
 
-@pytest.mark.parametrize("kind, twist", [("quotient", 0), ("quotient", 1), ("quotient", 2),
-                                         ("plain", 1), ("plain", 2)])
+
+@pytest.mark.parametrize(
+    "kind, twist", [("quotient", 0), ("quotient", 1), ("quotient", 2), ("plain", 1), ("plain", 2)]
+)
 def test_every_ray_names_the_true_surface(rgb, kind, twist):
     far, close, error, _ = compare(rgb, kind, twist, 0.25)
     assert far == 0
@@ -19,6 +21,7 @@ def test_every_ray_names_the_true_surface(rgb, kind, twist):
     assert error <= LIMITS[kind][1]
     finer = compare(rgb, kind, twist, 0.25 / 4)
     assert twist == 0 or finer[1] < close
+
 
 def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
     """Mitsuba 3.9.1 merges meshes of one material while loading, but not their bounding boxes."""
@@ -29,15 +32,20 @@ def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
     mi = rgb
     up = mi.ScalarTransform4f().translate
     grey = {"type": "diffuse"}
-    scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle", "bsdf": grey},
-                          "ceiling": {"type": "rectangle", "to_world": up([0, 0, 10]),
-                                      "bsdf": grey}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "bsdf": grey},
+            "ceiling": {"type": "rectangle", "to_world": up([0, 0, 10]), "bsdf": grey},
+        }
+    )
     assert len(scene.shapes()) == 1
     assert Shapes(scene).box.max.z == 10
     tracer = Tracer(scene, Space(1.0, False, [0, 0, 0], 1.0), dr.inf)
     p, v = mi.Point3f(0, 0, 5), mi.Vector3f(0, 0, mi.Float([1, -1]))
     hit = tracer.intersect(p, v, Cone(0, 1e-3), tracer.reach(p, v), mi.Bool(True))
     assert dr.allclose(hit.distance, 5)
+
 
 def check_that_rays_end(mi, p, v, twist):
     """Each ray ends by a hit within the cube or at ``max_distance``, with finite values."""
@@ -56,6 +64,7 @@ def check_that_rays_end(mi, p, v, twist):
     assert dr.all(~hit.valid | (dr.abs(dr.norm(si.wi) - 1) < 1e-4))
     # Most rays of this scene hit something: an empty result would pass the lines above.
     assert dr.count(hit.valid)[0] > 0.2 * dr.width(p)
+
 
 @pytest.mark.parametrize("twist", [0, 1, -2])
 def test_aimed_rays_end(rgb, twist):
@@ -76,13 +85,18 @@ def test_aimed_rays_end(rgb, twist):
         "horizontal": (p, mi.Vector3f(number() - 0.5, number() - 0.5, 0)),
         "vertical": (p, mi.Vector3f(0, 0, dr.sign(number() - 0.5))),
     }
-    p = [dr.concat([mi.Float(start[0][i]) + dr.zeros(mi.Float, count)
-                    for start in starts.values()]) for i in range(3)]
-    v = [dr.concat([mi.Float(start[1][i]) + dr.zeros(mi.Float, count)
-                    for start in starts.values()]) for i in range(3)]
+    p = [
+        dr.concat([mi.Float(start[0][i]) + dr.zeros(mi.Float, count) for start in starts.values()])
+        for i in range(3)
+    ]
+    v = [
+        dr.concat([mi.Float(start[1][i]) + dr.zeros(mi.Float, count) for start in starts.values()])
+        for i in range(3)
+    ]
     v = mi.Vector3f(*v)
     v = dr.select(dr.norm(v) > 1e-6, dr.normalize(v), mi.Vector3f(0, 0, 1))
     check_that_rays_end(mi, mi.Point3f(*p), v, twist)
+
 
 @pytest.mark.verify
 @pytest.mark.parametrize("twist", [0, 1, 2, -3])
@@ -92,5 +106,6 @@ def test_ten_million_random_rays_end(rgb, twist):
         random = mi.PCG32(1_000_000, seed)
         p = mi.Point3f(*(random.next_float32() for _ in range(3)))
         v = mi.warp.square_to_uniform_sphere(
-            mi.Point2f(random.next_float32(), random.next_float32()))
+            mi.Point2f(random.next_float32(), random.next_float32())
+        )
         check_that_rays_end(mi, p, v, twist)

@@ -40,7 +40,7 @@ def geodesic_by_ode(p, v, t, twist):
         k = mpmath.mpf(twist)
         x, y, z = map(mpmath.mpf, p)
         a, b, w = map(mpmath.mpf, v)
-        pz, py = w, b - k * x * w     # both conserved: no coefficient depends on y or z
+        pz, py = w, b - k * x * w  # both conserved: no coefficient depends on y or z
 
         def equations(_, state):
             x, y, z, px = state
@@ -51,17 +51,20 @@ def geodesic_by_ode(p, v, t, twist):
         return [float(c) for c in (x, y, z)], [float(c) for c in (px, py + k * x * pz, pz)]
 
 
-@pytest.mark.parametrize("p, v, t, twist", [
-    ((0.3, -0.7, 0.2), (0.6, 0.48, 0.64), 5.0, 1.0),
-    ((0.3, -0.7, 0.2), (0.6, -0.48, -0.64), 12.0, 2.0),
-    ((-0.9, 0.4, 0.1), (0.6, 0.8, 0.0), 7.0, 1.0),
-    ((0.5, 0.5, 0.5), (0.28, 0.96, 1e-9), 5.0, 3.0),
-    ((0.5, 0.5, 0.5), (0.28, 0.96, -1e-2), 6.0, -2.0),
-    ((0.1, 0.2, 0.3), (0.0, 0.0, 1.0), 4.0, 2.0),
-    ((0.1, 0.2, 0.3), (0.0, -0.6, 0.8), 1.2499999, 1.0),   # u just below the switch at 1
-    ((0.1, 0.2, 0.3), (0.0, -0.6, 0.8), 1.2500001, 1.0),   # and just above
-    ((0.7, 0.2, 0.3), (0.48, -0.6, 0.64), 9.0, 0.0),
-])
+@pytest.mark.parametrize(
+    "p, v, t, twist",
+    [
+        ((0.3, -0.7, 0.2), (0.6, 0.48, 0.64), 5.0, 1.0),
+        ((0.3, -0.7, 0.2), (0.6, -0.48, -0.64), 12.0, 2.0),
+        ((-0.9, 0.4, 0.1), (0.6, 0.8, 0.0), 7.0, 1.0),
+        ((0.5, 0.5, 0.5), (0.28, 0.96, 1e-9), 5.0, 3.0),
+        ((0.5, 0.5, 0.5), (0.28, 0.96, -1e-2), 6.0, -2.0),
+        ((0.1, 0.2, 0.3), (0.0, 0.0, 1.0), 4.0, 2.0),
+        ((0.1, 0.2, 0.3), (0.0, -0.6, 0.8), 1.2499999, 1.0),  # u just below the switch at 1
+        ((0.1, 0.2, 0.3), (0.0, -0.6, 0.8), 1.2500001, 1.0),  # and just above
+        ((0.7, 0.2, 0.3), (0.48, -0.6, 0.64), 9.0, 0.0),
+    ],
+)
 def test_flow_solves_hamiltons_equations(p, v, t, twist):
     position, direction = truth.flow(*ray(p, v), Float64(t), Float64(twist))
     expected_position, expected_direction = geodesic_by_ode(p, v, t, twist)
@@ -76,6 +79,7 @@ def test_left_division_undoes_the_group_product():
 
 
 # -- Straight lines ---------------------------------------------------------------------------
+
 
 def straight_hits(surface, o, d):
     """Arc lengths of all meetings of o + t d with a surface, by solving for t."""
@@ -97,8 +101,8 @@ def straight_hits(surface, o, d):
         axis /= dr.norm(axis)
         r = o - Array3f64(*surface.p0)
         across, r = d - axis * dr.dot(d, axis), r - axis * dr.dot(r, axis)
-    a, b, c = dr.squared_norm(across), dr.dot(across, r), dr.squared_norm(r) - surface.radius ** 2
-    root = dr.sqrt(b * b - a * c)      # NaN without an intersection: fails every comparison
+    a, b, c = dr.squared_norm(across), dr.dot(across, r), dr.squared_norm(r) - surface.radius**2
+    root = dr.sqrt(b * b - a * c)  # NaN without an intersection: fails every comparison
     hits = [(-b - root) / a, (-b + root) / a]
     if isinstance(surface, truth.Cylinder):
         length = math.dist(surface.p0, surface.p1)
@@ -169,8 +173,12 @@ def test_quotient_is_all_images_of_the_scene_under_the_lattice(twist):
     # Left translations are isometries: the image g·S is met where S is met from g⁻¹·p. The
     # heights of images reach as far as the ray and the shear k gx y over one cell together.
     t_max = 1.2
-    cells = [(x, y, z) for x in range(-2, 3) for y in range(-2, 3)
-             for z in range(-3 - 4 * twist, 4 + 4 * twist)]
+    cells = [
+        (x, y, z)
+        for x in range(-2, 3)
+        for y in range(-2, 3)
+        for z in range(-3 - 4 * twist, 4 + 4 * twist)
+    ]
     p, v = random_rays(1500, (0.5, 0.5, 0.5), 1, seed=4)
     hit = truth.first_hit(truth.cell_scene(), p, v, t_max, twist, quotient=True)
 
@@ -185,18 +193,23 @@ def test_quotient_is_all_images_of_the_scene_under_the_lattice(twist):
 
 # -- Curved rays ------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("scene, center, twist, quotient", [
-    (truth.cell_scene, (0.5, 0.5, 0.5), 1, True),
-    (truth.cell_scene, (0.5, 0.5, 0.5), 2, True),
-    (truth.room_scene, (0, 0, 0), 1, False),
-    (truth.room_scene, (0, 0, 0), 2, False),
-])
+
+@pytest.mark.parametrize(
+    "scene, center, twist, quotient",
+    [
+        (truth.cell_scene, (0.5, 0.5, 0.5), 1, True),
+        (truth.cell_scene, (0.5, 0.5, 0.5), 2, True),
+        (truth.room_scene, (0, 0, 0), 1, False),
+        (truth.room_scene, (0, 0, 0), 2, False),
+    ],
+)
 def test_a_finer_scan_finds_the_same_hits(scene, center, twist, quotient):
     p, v = random_rays(30_000, center, 1, seed=5)
     coarse = truth.first_hit(scene(), p, v, 12.0, twist, quotient)
     fine = truth.first_hit(scene(), p, v, 12.0, twist, quotient, step=truth.STEP / 4)
-    assert dr.all(truth.surface_hash(coarse.label, coarse.g)
-                  == truth.surface_hash(fine.label, fine.g))
+    assert dr.all(
+        truth.surface_hash(coarse.label, coarse.g) == truth.surface_hash(fine.label, fine.g)
+    )
     assert dr.max(dr.select(fine.t < math.inf, dr.abs(coarse.t - fine.t), 0))[0] < 1e-9
 
 
@@ -255,8 +268,19 @@ def test_a_surface_in_a_face_of_the_cube_is_seen_from_both_sides(height, directi
 def test_rays_along_faces_and_edges_and_through_corners_end():
     starts = [(0, 0.5, 0.5), (0, 0, 0.5), (0, 0, 0), (0.5, 0.5, 0.5), (0.5, 0, 0)]
     r2, r3 = math.sqrt(0.5), math.sqrt(1 / 3)
-    ways = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1), (r2, r2, 0), (0, r2, -r2), (r3, r3, r3),
-            (-r3, -r3, -r3), (0, 1, 1e-17), (1e-9, 1e-9, 1), (1, -1e-17, 1e-12)]
+    ways = [
+        (1, 0, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+        (0, 0, -1),
+        (r2, r2, 0),
+        (0, r2, -r2),
+        (r3, r3, r3),
+        (-r3, -r3, -r3),
+        (0, 1, 1e-17),
+        (1e-9, 1e-9, 1),
+        (1, -1e-17, 1e-12),
+    ]
     rays = [(p, v) for p in starts for v in ways]
     p = Array3f64(*(Float64([r[0][i] for r in rays]) for i in range(3)))
     v = Array3f64(*(Float64([r[1][i] for r in rays]) for i in range(3)))
@@ -267,6 +291,7 @@ def test_rays_along_faces_and_edges_and_through_corners_end():
 
 
 # -- Measures ---------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("twist", [0, 1, 2])
 def test_error_is_measured_across_the_geodesic_only(twist):
@@ -292,16 +317,18 @@ def test_pixels_next_to_another_label_are_near_a_silhouette():
 
 
 def test_hashes_tell_surfaces_and_cells_apart_and_misses_are_one():
-    g = Array3i(Int32([0, 0, 1, 0, -1, 2, -3]), Int32([0, 1, 0, 0, 0, 5, 4]),
-                Int32([0, 0, 0, 1, 0, 1, 0]))
+    g = Array3i(
+        Int32([0, 0, 1, 0, -1, 2, -3]), Int32([0, 1, 0, 0, 0, 5, 4]), Int32([0, 0, 0, 1, 0, 1, 0])
+    )
     hashes = list(truth.surface_hash(Int32([0, 0, 0, 0, 0, -1, -1]), g))
     assert len(set(hashes[:5])) == 5
     assert hashes[5:] == [0, 0]
     assert truth.surface_hash(Int32(1), Array3i(0))[0] not in hashes
 
 
-@pytest.mark.parametrize("scene, center", [(truth.cell_scene, (0.5, 0.5, 0.5)),
-                                           (truth.room_scene, (0, 0, 0))])
+@pytest.mark.parametrize(
+    "scene, center", [(truth.cell_scene, (0.5, 0.5, 0.5)), (truth.room_scene, (0, 0, 0))]
+)
 def test_mitsuba_gets_the_same_surfaces(scene, center):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("llvm_ad_rgb")

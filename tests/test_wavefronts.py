@@ -21,14 +21,28 @@ def description(size=16, sampler="independent", rfilter="box", film=(), **integr
             "type": "perspective",
             "to_world": mi.ScalarTransform4f().look_at([0.1, 0.1, 0.6], [0.7, 1, 0.4], [0, 0, 1]),
             "sampler": {"type": sampler},
-            "film": {"type": "hdrfilm", "width": size, "height": size,
-                     "component_format": "float32", "rfilter": {"type": rfilter}} | dict(film),
+            "film": {
+                "type": "hdrfilm",
+                "width": size,
+                "height": size,
+                "component_format": "float32",
+                "rfilter": {"type": rfilter},
+            }
+            | dict(film),
         },
         "sky": {"type": "constant", "radiance": 0.125},
-        "lamp": {"type": "sphere", "center": [0.3, 0.4, 0.8], "radius": 0.1,
-                 "light": {"type": "area"}},
-        "ball": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.2,
-                 "bsdf": {"type": "diffuse"}},
+        "lamp": {
+            "type": "sphere",
+            "center": [0.3, 0.4, 0.8],
+            "radius": 0.1,
+            "light": {"type": "area"},
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [0.5, 0.5, 0.5],
+            "radius": 0.2,
+            "bsdf": {"type": "diffuse"},
+        },
     }
 
 
@@ -63,14 +77,22 @@ def cut(module, monkeypatch):
     return cut
 
 
-BORDERED = {"sample_border": True, "crop_width": 9, "crop_height": 5, "crop_offset_x": 3,
-            "crop_offset_y": 7}
+BORDERED = {
+    "sample_border": True,
+    "crop_width": 9,
+    "crop_height": 5,
+    "crop_offset_x": 3,
+    "crop_offset_y": 7,
+}
 
 
 @pytest.mark.parametrize(
     "scene",
-    [{}, {"rfilter": "gaussian", "film": BORDERED},
-     {"aovs": "distance, position, cell, shape, samples"}],
+    [
+        {},
+        {"rfilter": "gaussian", "film": BORDERED},
+        {"aovs": "distance, position, cell, shape, samples"},
+    ],
     ids=["box", "border", "layers"],
 )
 def test_the_picture_is_the_same_wherever_wavefronts_are_cut(rgb, cut, scene):
@@ -182,8 +204,9 @@ def test_sums_with_other_random_numbers_are_refused(rgb, tmp_path):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_tiles_of_other_samplers_follow_from_the_settings_alone(rgb, cut, module, monkeypatch,
-                                                                sampler):
+def test_tiles_of_other_samplers_follow_from_the_settings_alone(
+    rgb, cut, module, monkeypatch, sampler
+):
     loaded = mi.load_dict(description(sampler=sampler))
     spp = SAMPLERS[sampler]
     monkeypatch.setattr(module, "TILE_SAMPLES", spp * 60)  # 256 pixels: five tiles of 52
@@ -200,8 +223,11 @@ def test_tiles_of_other_samplers_follow_from_the_settings_alone(rgb, cut, module
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_tiles_are_images_of_the_same_scene(rgb, module, monkeypatch, sampler):
     # Under the sky alone all samples are equal: a pixel that a tile left out, or drew twice, shows
-    sky = {key: value for key, value in description(sampler=sampler).items()
-           if key not in ("lamp", "ball")}
+    sky = {
+        key: value
+        for key, value in description(sampler=sampler).items()
+        if key not in ("lamp", "ball")
+    }
     spp = SAMPLERS[sampler]
     monkeypatch.setattr(module, "TILE_SAMPLES", spp * 60)
     loaded = mi.load_dict(sky)

@@ -53,8 +53,10 @@ def z_scores(first: Estimate, second: Estimate, block: int | None = None) -> lis
     else:
         assert rows % block == 0 and columns % block == 0
         across = columns // block
-        index, count = (pixel // columns) // block * across + (pixel % columns) // block, \
-            rows // block * across
+        index, count = (
+            (pixel // columns) // block * across + (pixel % columns) // block,
+            rows // block * across,
+        )
     scores = []
     for c in range(3):
         difference, variance = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)

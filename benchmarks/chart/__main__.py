@@ -23,8 +23,13 @@ def main():
     began = time.perf_counter()
     parser = argparse.ArgumentParser(description=about.split("\n\n")[0])
     parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "charts",
-                        help="folder of the charts and tables (default: charts)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=pathlib.Path,
+        default=ROOT / "charts",
+        help="folder of the charts and tables (default: charts)",
+    )
     arguments = parser.parse_args()
     quick, folder = arguments.quick, arguments.output
     folder.mkdir(parents=True, exist_ok=True)
@@ -53,8 +58,11 @@ def main():
     for setup in setups():
         if quick and (setup.kind, setup.space) != ("sparse", "plain"):
             continue
-        found = (images(setup, IMAGE_KNOBS[-2:], 32, 24, 1, (1, 2, 4), 4) if quick
-                 else images(setup, IMAGE_KNOBS, 80, 60, 8, (1, 2, 4), 128))
+        found = (
+            images(setup, IMAGE_KNOBS[-2:], 32, 24, 1, (1, 2, 4), 4)
+            if quick
+            else images(setup, IMAGE_KNOBS, 80, 60, 8, (1, 2, 4), 128)
+        )
         image_rows += found[0]
         differences += found[1]
         report(f"rendered: {setup.kind}, {setup.space}", began)

@@ -24,7 +24,7 @@ HEYOKA = pathlib.Path(__file__).with_name("heyoka_end_points.py")
 
 def random_starts(count, float_t):
     """Starts in the unit cube and directions in all of the sphere, the same for all types."""
-    random = mi.PCG32(count)    # stream i is ray i's, whatever their number
+    random = mi.PCG32(count)  # stream i is ray i's, whatever their number
     numbers = [dr.llvm.Float(dr.detach(random.next_float32())) for _ in range(5)]
     z, phi = 2 * numbers[3] - 1, 2 * math.pi * numbers[4]
     c = dr.sqrt((1 - z) * (1 + z))
@@ -68,15 +68,31 @@ def end_points(lengths, rounds, quick=False):
             contestants.append((length, PACKAGE, name, float_t, 0.0, closed_form))
             for i in range(8, 9) if quick else range(4, 13):
                 steps = round(length * 2 ** (i / 2))
-                contestants.append((length, "Runge–Kutta 4", name, float_t, length / steps,
-                                    lambda p, v, length, steps=steps:
-                                    fixed_steps(p, v, length, steps, TWIST)))
+                contestants.append(
+                    (
+                        length,
+                        "Runge–Kutta 4",
+                        name,
+                        float_t,
+                        length / steps,
+                        lambda p, v, length, steps=steps: fixed_steps(p, v, length, steps, TWIST),
+                    )
+                )
             tightest = 25 if name == "float64" else 15
             for i in range(13, 14) if quick else range(8, tightest):
                 tolerance = 10 ** (-i / 2)
-                contestants.append((length, "Dormand–Prince", name, float_t, tolerance,
-                                    lambda p, v, length, tolerance=tolerance:
-                                    adaptive_steps(p, v, length, tolerance, TWIST)))
+                contestants.append(
+                    (
+                        length,
+                        "Dormand–Prince",
+                        name,
+                        float_t,
+                        tolerance,
+                        lambda p, v, length, tolerance=tolerance: adaptive_steps(
+                            p, v, length, tolerance, TWIST
+                        ),
+                    )
+                )
     starts = {}
     for float_t in (dr.llvm.Float, dr.llvm.Float64):
         for count in (ENDS, CLOSED_ENDS):
@@ -95,8 +111,16 @@ def end_points(lengths, rounds, quick=False):
             nanoseconds = 1e9 * min(times) / count
             if turn == 0:
                 error = root_mean_square_error(Array3f64(*(Float64(x) for x in ends)), length)
-                rows.append({"length": length, "method": method, "precision": precision,
-                             "knob": knob, "error": error, "nanoseconds": nanoseconds})
+                rows.append(
+                    {
+                        "length": length,
+                        "method": method,
+                        "precision": precision,
+                        "knob": knob,
+                        "error": error,
+                        "nanoseconds": nanoseconds,
+                    }
+                )
             rows[i]["nanoseconds"] = min(rows[i]["nanoseconds"], nanoseconds)
     for row in rows:
         row["per second"] = 1e9 / row["nanoseconds"]
@@ -113,16 +137,25 @@ def heyoka_rows(lengths):
     for length in lengths:
         for tolerance in (1e-3, 1e-5, 1e-8, 1e-12):
             task = {"starts": starts, "length": length, "tolerance": tolerance}
-            done = subprocess.run([sys.executable, HEYOKA],
-                                  input=json.dumps(task), capture_output=True, text=True)
+            done = subprocess.run(
+                [sys.executable, HEYOKA], input=json.dumps(task), capture_output=True, text=True
+            )
             if done.returncode:
                 raise RuntimeError(f"{HEYOKA.name} failed:\n{done.stderr}")
             result = json.loads(done.stdout)
             ends = Array3f64(*(Float64(x) for x in zip(*result["ends"])))
             nanoseconds = 1e9 * result["seconds"] / len(starts)
-            rows.append({"length": length, "method": "heyoka", "precision": "float64",
-                         "knob": tolerance, "error": root_mean_square_error(ends, length),
-                         "nanoseconds": nanoseconds, "per second": 1e9 / nanoseconds})
+            rows.append(
+                {
+                    "length": length,
+                    "method": "heyoka",
+                    "precision": "float64",
+                    "knob": tolerance,
+                    "error": root_mean_square_error(ends, length),
+                    "nanoseconds": nanoseconds,
+                    "per second": 1e9 / nanoseconds,
+                }
+            )
     return rows
 
 

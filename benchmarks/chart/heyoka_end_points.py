@@ -23,12 +23,15 @@ x, y, z, a, b = heyoka.make_vars("x", "y", "z", "a", "b")
 w = heyoka.par[0]
 integrator = heyoka.taylor_adaptive_batch(
     [(x, a), (y, b), (z, w + x * b), (a, -w * b), (b, w * a)],
-    state=[[0.0] * BATCH] * 5, pars=[[0.0] * BATCH], tol=task["tolerance"])
+    state=[[0.0] * BATCH] * 5,
+    pars=[[0.0] * BATCH],
+    tol=task["tolerance"],
+)
 
 # In its own arrays, which are handed over faster than lists
 batches = []
 for i in range(0, len(task["starts"]), BATCH):
-    columns = list(zip(*task["starts"][i:i + BATCH]))
+    columns = list(zip(*task["starts"][i : i + BATCH]))
     integrator.state[:], integrator.pars[:] = columns[:5], columns[5:]
     batches.append((integrator.state.copy(), integrator.pars.copy()))
 
@@ -48,5 +51,10 @@ def run(length):
 idle = min(run(0.0)[0] for _ in range(5))
 seconds = min(run(task["length"])[0] for _ in range(5))
 _, ends = run(task["length"])
-json.dump({"ends": [list(point) for columns in ends for point in zip(*columns.tolist())],
-           "seconds": seconds - idle}, sys.stdout)
+json.dump(
+    {
+        "ends": [list(point) for columns in ends for point in zip(*columns.tolist())],
+        "seconds": seconds - idle,
+    },
+    sys.stdout,
+)

@@ -13,7 +13,10 @@ from .rays import Selection, errors, trace
 PACKAGE = "nil_mitsuba"
 STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 KNOBS = {
-    "Euler pieces": STEPS, "Runge–Kutta 4": STEPS, "printed form": STEPS, "stable form": STEPS,
+    "Euler pieces": STEPS,
+    "Runge–Kutta 4": STEPS,
+    "printed form": STEPS,
+    "stable form": STEPS,
     "Dormand–Prince": (1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
     PACKAGE: (64, 16, 4, 1, 0.25, 0.0625, 0.015625),
 }
@@ -64,8 +67,14 @@ def measure(rays, length, rounds, most):
                 continue
             tolerance = knob if method == PACKAGE else 1.0
             tracer = tracer_of(method, knob, rays.scene, rays.space)
-            row = {"scene": rays.setup.kind, "space": rays.setup.space, "length": length,
-                   "method": method, "knob": knob, **errors(tracer, selection, tolerance)}
+            row = {
+                "scene": rays.setup.kind,
+                "space": rays.setup.space,
+                "length": length,
+                "method": method,
+                "knob": knob,
+                **errors(tracer, selection, tolerance),
+            }
             entries.append((row, tracer, tolerance, []))
     for _ in range(rounds):
         for _, tracer, tolerance, times in entries:

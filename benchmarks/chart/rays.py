@@ -37,18 +37,21 @@ class Rays:
         else:
             shapes = truth.to_mitsuba(setup.surfaces, mi)
         self.scene = mi.load_dict({"type": "scene", **shapes})
-        sensor = mi.load_dict({
-            "type": "perspective", "fov": setup.fov,
-            "to_world": mi.ScalarTransform4f().look_at(list(setup.origin), list(setup.target),
-                                                       [0.01, 0.02, 1]),
-            "film": {"type": "hdrfilm", "width": IMAGE, "height": IMAGE},
-        })
+        sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": setup.fov,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    list(setup.origin), list(setup.target), [0.01, 0.02, 1]
+                ),
+                "film": {"type": "hdrfilm", "width": IMAGE, "height": IMAGE},
+            }
+        )
         index = dr.arange(mi.UInt32, width * width)
         place = mi.Point2f(index % width + 0.5, index // width + 0.5) / width
         ray, _ = sensor.sample_ray_differential(0, 0.5, place, mi.Point2f(0.5))
         # The cone of a tolerance of one pixel
-        p, self.v, self.cone, _ = Camera(
-            sensor, self.space, 1.0).start(ray, mi.Float(0))
+        p, self.v, self.cone, _ = Camera(sensor, self.space, 1.0).start(ray, mi.Float(0))
         self.p = mi.Point3f(p)
         dr.eval(self.p, self.v, self.cone)
 
@@ -107,6 +110,7 @@ class Rays:
 @dataclass
 class Selection:
     """Some of the rays, ready to be traced up to a length."""
+
     rays: Rays
     index: object
     length: float
@@ -133,8 +137,9 @@ def trace(tracer, selection, tolerance):
     if setup.mirror is None:
         return hit, v, hit.cell
     si = surface_interaction(hit, v, space, mi.Color0f())
-    mirror = si.shape == mi.ShapePtr(next(s for s in selection.rays.scene.shapes()
-                                          if s.id() == f"s{setup.mirror}"))
+    mirror = si.shape == mi.ShapePtr(
+        next(s for s in selection.rays.scene.shapes() if s.id() == f"s{setup.mirror}")
+    )
     # Where the integrator moves the start along the normal, which shifts a mirrored ray sideways
     # by 1e-4 cells whatever the method, these rays start further along themselves.
     v = mi.Vector3f(si.to_world(mi.reflect(si.wi)))
@@ -145,8 +150,9 @@ def trace(tracer, selection, tolerance):
         cell = multiply_cells(cell, mi.Vector3i(home), space)
     # As behind the integrator's mirrors
     cone = Cone(dr.fma(cone.spread, hit.distance, cone.width), cone.spread)
-    hit = tracer.intersect(p, v, cone, dr.minimum(tracer.reach(p, v), length - OFF),
-                           hit.valid & mirror)
+    hit = tracer.intersect(
+        p, v, cone, dr.minimum(tracer.reach(p, v), length - OFF), hit.valid & mirror
+    )
     if setup.quotient:
         cell = multiply_cells(cell, hit.cell, space)
     return hit, v, cell
@@ -159,8 +165,10 @@ def wide(x):
 
 def quantiles(values, shares):
     values = sorted(values)
-    return [values[min(len(values) - 1, int(share * len(values)))] if values else math.nan
-            for share in shares]
+    return [
+        values[min(len(values) - 1, int(share * len(values)))] if values else math.nan
+        for share in shares
+    ]
 
 
 class Watched:
@@ -195,17 +203,24 @@ def errors(tracer, selection, tolerance):
         for shape in rays.scene.shapes():
             named = hit.valid & (hit.preliminary.shape == mi.ShapePtr(shape))
             label = dr.select(named, int(shape.id()[1:]), label)
-    p, arrival, distance, valid, cell = (mi.Point3f(si.p), mi.Vector3f(hit.arrival), hit.distance,
-                                         hit.valid, mi.Vector3i(cell))
+    p, arrival, distance, valid, cell = (
+        mi.Point3f(si.p),
+        mi.Vector3f(hit.arrival),
+        hit.distance,
+        hit.valid,
+        mi.Vector3i(cell),
+    )
     dr.eval(p, arrival, distance, valid, label, cell, watched.segments, watched.lost)
 
     exact = rays.exact
     t = dr.gather(Float64, exact.t, index)
     length = dr.opaque(Float64, selection.length)
     true_label = dr.select(t <= length, dr.gather(Int32, exact.label, index), -1)
-    true_g, true_p, true_v = (dr.gather(Array3i, exact.g, index),
-                              dr.gather(Array3f64, exact.p_cell, index),
-                              dr.gather(Array3f64, exact.v, index))
+    true_g, true_p, true_v = (
+        dr.gather(Array3i, exact.g, index),
+        dr.gather(Array3f64, exact.p_cell, index),
+        dr.gather(Array3f64, exact.v, index),
+    )
     near = dr.gather(truth.Bool, rays.near, index)
     label = Int32(label)
     cell = Array3i(*(Int32(c) for c in cell))
@@ -228,11 +243,20 @@ def errors(tracer, selection, tolerance):
 
     median, most, largest = quantiles(position, (0.5, 0.99, 1))
     return {
-        "rays": count, "hits": len(position),
-        "position": median, "position 99 %": most, "position max": largest,
-        **dict(zip(("direction", "direction 99 %", "direction max"),
-                   quantiles(direction, (0.5, 0.99, 1)))),
-        "other surface": share(wrong), "other surface, away": share(wrong, ~near),
-        "other surface, near": share(wrong, near), "not a number": share(hollow),
+        "rays": count,
+        "hits": len(position),
+        "position": median,
+        "position 99 %": most,
+        "position max": largest,
+        **dict(
+            zip(
+                ("direction", "direction 99 %", "direction max"),
+                quantiles(direction, (0.5, 0.99, 1)),
+            )
+        ),
+        "other surface": share(wrong),
+        "other surface, away": share(wrong, ~near),
+        "other surface, near": share(wrong, near),
+        "not a number": share(hollow),
         "chords": dr.sum(watched.segments)[0] / count,
     }

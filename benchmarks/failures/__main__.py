@@ -21,14 +21,18 @@ from .crossings import (
     sign_change,
 )
 
-METHODS = {"report's formula": geodesics.report,
-           "Runge–Kutta 4, step 0.05": geodesics.runge_kutta,
-           "Dormand–Prince, 1e-6": geodesics.dormand_prince,
-           "package": geodesics.package}
-COLUMNS = {"printed form, chords 0.05": "printed form",
-           "Runge–Kutta 4, chords 0.05": "Runge–Kutta 4",
-           "Dormand–Prince, 1e-4": "Dormand–Prince",
-           "package": "package"}
+METHODS = {
+    "report's formula": geodesics.report,
+    "Runge–Kutta 4, step 0.05": geodesics.runge_kutta,
+    "Dormand–Prince, 1e-6": geodesics.dormand_prince,
+    "package": geodesics.package,
+}
+COLUMNS = {
+    "printed form, chords 0.05": "printed form",
+    "Runge–Kutta 4, chords 0.05": "Runge–Kutta 4",
+    "Dormand–Prince, 1e-4": "Dormand–Prince",
+    "package": "package",
+}
 NOT_GIVEN, NOTHING = "not given", "–"
 
 
@@ -62,6 +66,7 @@ def share(part, whole=1):
 #  Geodesics alone
 # ---------------------------------------------------------------------------
 
+
 def worst_errors(*rays, k=1):
     """Largest error of each method over sets of rays (p, v, length), and the share beyond 1e-3."""
     cells = []
@@ -80,14 +85,23 @@ def worst_errors(*rays, k=1):
 
 def directions(sizes):
     count = sizes.rays(20_000)
-    for name, components in (("w = 0", [0]), ("w = 1e-5", [1e-5]), ("w = 1e-3", [1e-3]),
-                             ("w = ±1, c = 0", [1, -1]), ("w = ±(1 − 1e-6)", [1 - 1e-6, 1e-6 - 1])):
-        yield f"{name}, length 5", worst_errors(
-            *((*geodesics.random_rays(count, w), 5) for w in components))
+    for name, components in (
+        ("w = 0", [0]),
+        ("w = 1e-5", [1e-5]),
+        ("w = 1e-3", [1e-3]),
+        ("w = ±1, c = 0", [1, -1]),
+        ("w = ±(1 − 1e-6)", [1 - 1e-6, 1e-6 - 1]),
+    ):
+        yield (
+            f"{name}, length 5",
+            worst_errors(*((*geodesics.random_rays(count, w), 5) for w in components)),
+        )
     rays = geodesics.random_rays(count, 0.75)
     t = 2 * math.sqrt(2) / 0.75
-    yield ("both sides of the switch of formula, k w t/2 = √2",
-           worst_errors((*rays, t * (1 - 1e-5)), (*rays, t * (1 + 1e-5))))
+    yield (
+        "both sides of the switch of formula, k w t/2 = √2",
+        worst_errors((*rays, t * (1 - 1e-5)), (*rays, t * (1 + 1e-5))),
+    )
 
 
 def lengths(sizes):
@@ -101,8 +115,7 @@ def places_and_twists(sizes):
     for out in (100, 10_000):
         yield f"{out:,} cells from the identity, length 5", worst_errors((p + out, v, 5))
     for k in (1e-6, 3, 8):
-        yield f"twist {k:g}, length 5".replace("e-0", "e-"), worst_errors(
-            (p, v, 5), k=k)
+        yield f"twist {k:g}, length 5".replace("e-0", "e-"), worst_errors((p, v, 5), k=k)
 
 
 def crossings(sizes):
@@ -112,26 +125,33 @@ def crossings(sizes):
         p, v, ahead, exact = crossings_ahead(Array3f, axis, sizes.rays(100_000))
         formula = (report_formulas.crossing_of_x, report_formulas.crossing_of_y, None)[axis]
         found = [formula(p, v, ahead) if formula else None]
-        found += [sign_change(method, p, v, axis, ahead, FURTHER)
-                  for method in ("Runge–Kutta 4", "Dormand–Prince")]
+        found += [
+            sign_change(method, p, v, axis, ahead, FURTHER)
+            for method in ("Runge–Kutta 4", "Dormand–Prince")
+        ]
         found += [first_crossing(p, v, axis, ahead, FURTHER)]
-        yield (f"crossing of the face {name} ahead, off for",
-               [NOT_GIVEN if t is None else share(rays_off(t, exact), dr.width(p))
-                for t in found])
+        yield (
+            f"crossing of the face {name} ahead, off for",
+            [NOT_GIVEN if t is None else share(rays_off(t, exact), dr.width(p)) for t in found],
+        )
 
 
 def tangents(sizes):
     p, v, c, exact = crossings_just_reached(sizes.rays(100_000))
-    found = [sign_change(method, p, v, 2, c, 12.0)
-             for method in ("Runge–Kutta 4", "Dormand–Prince")]
+    found = [
+        sign_change(method, p, v, 2, c, 12.0) for method in ("Runge–Kutta 4", "Dormand–Prince")
+    ]
     found += [first_crossing(p, v, 2, c, 12.0)]
-    yield ("crossing of a plane z = c that a ray only just reaches, off for",
-           [NOT_GIVEN] + [share(rays_off(t, exact, 0.01, 11.9), dr.width(p)) for t in found])
+    yield (
+        "crossing of a plane z = c that a ray only just reaches, off for",
+        [NOT_GIVEN] + [share(rays_off(t, exact, 0.01, 11.9), dr.width(p)) for t in found],
+    )
 
 
 # ---------------------------------------------------------------------------
 #  Tracing
 # ---------------------------------------------------------------------------
+
 
 def by_each(measure):
     """A row: what ``measure`` says of each tracer, given its name and what makes it."""
@@ -148,12 +168,24 @@ def faces(sizes):
     for kind, names in kinds.items():
         p, v = tracing.aimed_rays(names, 1, each)
         count = each * len(names)
-        yield (f"{kind}: name another surface, of {count:,} rays",
-               by_each(lambda _, make: share(dr.count(tracing.naming(
-                   truth.cell_scene(), p, v, 1, True, make=make)[2])[0], count)))
-    yield (f"along a face: miss the wall ahead, of {3 * each:,} rays",
-           by_each(lambda _, make: share(sum(tracing.walls_along_faces(axis, 1, make, each)[0]
-                                             for axis in range(3)), 3 * each)))
+        yield (
+            f"{kind}: name another surface, of {count:,} rays",
+            by_each(
+                lambda _, make: share(
+                    dr.count(tracing.naming(truth.cell_scene(), p, v, 1, True, make=make)[2])[0],
+                    count,
+                )
+            ),
+        )
+    yield (
+        f"along a face: miss the wall ahead, of {3 * each:,} rays",
+        by_each(
+            lambda _, make: share(
+                sum(tracing.walls_along_faces(axis, 1, make, each)[0] for axis in range(3)),
+                3 * each,
+            )
+        ),
+    )
 
 
 def off(error, wrong):
@@ -173,22 +205,29 @@ def walls(sizes):
             corner[axis] = float(face)
             sides[0][axis - 2] = sides[1][axis - 1] = 100.0
             shapes[f"s{face}"] = truth.Rectangle(tuple(corner), *map(tuple, sides)).to_mitsuba(mi)
-        exact = [first_crossing(Array3f64(p), Array3f64(v), axis, Float64(face), FURTHER)
-                 for face in (0, 1)]
+        exact = [
+            first_crossing(Array3f64(p), Array3f64(v), axis, Float64(face), FURTHER)
+            for face in (0, 1)
+        ]
         scenes.append((shapes, dr.minimum(*exact)))
 
     def passed(_, make):
-        return share(sum(rays_off(Traced(shapes, p, v, 1, False, FURTHER, make=make).t,
-                                  exact) for shapes, exact in scenes), 3 * count)
+        return share(
+            sum(
+                rays_off(Traced(shapes, p, v, 1, False, FURTHER, make=make).t, exact)
+                for shapes, exact in scenes
+            ),
+            3 * count,
+        )
 
     yield f"walls at the faces: met 1e-3 off or not at all, of {3 * count:,} rays", by_each(passed)
 
 
 def long_ways(sizes):
     for t in sizes.lengths((20, 100, 500)):
+
         def walk(name, _):
-            walked = (geodesics.walked if name == "package" else
-                      geodesics.stepped(name, KNOBS[name]))
+            walked = geodesics.walked if name == "package" else geodesics.stepped(name, KNOBS[name])
             errors = geodesics.walk_errors(t, 1, sizes.rays(4000), walked)
             return " / ".join(number(dr.max(error)[0]) for error in errors)
 
@@ -197,8 +236,10 @@ def long_ways(sizes):
         count = sizes.rays(tracing.ENOUGH[bins])
         columns = by_each(lambda _, make: tracing.long_ray_errors(1, bins, count, make))
         for i, (low, high, hits, *_) in enumerate(columns[0]):
-            yield (f"hits {low} to {high} cells away: error, largest of {hits:,}",
-                   [off(rows[i][5], rows[i][3]) for rows in columns])
+            yield (
+                f"hits {low} to {high} cells away: error, largest of {hits:,}",
+                [off(rows[i][5], rows[i][3]) for rows in columns],
+            )
 
 
 def places_and_sizes(sizes):
@@ -207,25 +248,43 @@ def places_and_sizes(sizes):
     def text(wrong_and_error):
         return off(*reversed(wrong_and_error))
 
-    yield "cell_size 1e-3 and 1e4: error of 99 %", by_each(
-        lambda _, make: text(max(tracing.size_errors(size, 0, count, make)
-                                 for size in (1e-3, 1e4))))
-    yield "10,000 cells from the origin, cell_origin too: error of 99 %", by_each(
-        lambda _, make: text(tracing.size_errors(1.0, 10_000, count, make)))
+    yield (
+        "cell_size 1e-3 and 1e4: error of 99 %",
+        by_each(
+            lambda _, make: text(
+                max(tracing.size_errors(size, 0, count, make) for size in (1e-3, 1e4))
+            )
+        ),
+    )
+    yield (
+        "10,000 cells from the origin, cell_origin too: error of 99 %",
+        by_each(lambda _, make: text(tracing.size_errors(1.0, 10_000, count, make))),
+    )
     for distance in (100, 1000):
-        yield f"{distance:,} cells from the identity: error of 99 %", by_each(
-            # Fewer rays: the adaptive pair takes its smallest steps here
-            lambda _, make: text(tracing.far_errors(distance, count // 10, make)))
+        yield (
+            f"{distance:,} cells from the identity: error of 99 %",
+            by_each(
+                # Fewer rays: the adaptive pair takes its smallest steps here
+                lambda _, make: text(tracing.far_errors(distance, count // 10, make))
+            ),
+        )
 
 
 def thin_things(sizes):
     count = sizes.rays(20_000)
-    yield "sheets 1e-3 thick: name the other side", by_each(
-        lambda _, make: share(*tracing.sheet_rays(count, make)))
+    yield (
+        "sheets 1e-3 thick: name the other side",
+        by_each(lambda _, make: share(*tracing.sheet_rays(count, make))),
+    )
     with tempfile.TemporaryDirectory() as folder:
-        yield "needle triangles: passed, or met 8e-4 off", by_each(
-            lambda _, make: share(*tracing.needles_passed(Path(folder), 1, make, 10,
-                                                          sizes.rays(50_000))))
+        yield (
+            "needle triangles: passed, or met 8e-4 off",
+            by_each(
+                lambda _, make: share(
+                    *tracing.needles_passed(Path(folder), 1, make, 10, sizes.rays(50_000))
+                )
+            ),
+        )
     width = 32 if sizes.quick else 512
     found = by_each(lambda _, make: camera_rays.compare(mi, "quotient", 1, 0.25, width, make)[:2])
     for i, where in enumerate(("away from silhouettes", "within a pixel of silhouettes")):
@@ -233,19 +292,33 @@ def thin_things(sizes):
 
 
 def contacts(sizes):
-    yield "from contacts and corners: name another surface", by_each(
-        lambda _, make: share(*tracing.contact_rays(sizes.rays(20_000), make)))
+    yield (
+        "from contacts and corners: name another surface",
+        by_each(lambda _, make: share(*tracing.contact_rays(sizes.rays(20_000), make))),
+    )
     spp = 1 if sizes.quick else 64
-    yield "closed rooms, of one surface and of sheets, lights outside: pixels lit", by_each(
-        lambda _, make: share(sum(tracing.leaking_pixels(kind, 1, make, spp)
-                                  for kind in ("one surface", "sheets")), 2048))
-    yield "glowing corner: pixels too dark or too bright", by_each(
-        lambda _, make: share(tracing.off_in_a_corner(1, make), 1024))
+    yield (
+        "closed rooms, of one surface and of sheets, lights outside: pixels lit",
+        by_each(
+            lambda _, make: share(
+                sum(
+                    tracing.leaking_pixels(kind, 1, make, spp) for kind in ("one surface", "sheets")
+                ),
+                2048,
+            )
+        ),
+    )
+    yield (
+        "glowing corner: pixels too dark or too bright",
+        by_each(lambda _, make: share(tracing.off_in_a_corner(1, make), 1024)),
+    )
 
 
 def mirrors_and_glass(sizes):
-    yield "inside a glass ball: rays trapped / of another energy", by_each(
-        lambda _, make: " / ".join(share(part) for part in tracing.inside_glass(1, make)))
+    yield (
+        "inside a glass ball: rays trapped / of another energy",
+        by_each(lambda _, make: " / ".join(share(part) for part in tracing.inside_glass(1, make))),
+    )
 
     def mirrors(_, make):
         wrong, lost = tracing.off_between_mirrors(1, 10 if sizes.quick else 200, make)
@@ -260,10 +333,19 @@ def connections(sizes):
     def row(miss):
         return [NOT_GIVEN, NOTHING, NOTHING, number(miss)]
 
-    yield "connection to a point about its switch of formula: largest miss", row(
-        max(dr.max(geodesics.about_the_switch(Array3f, 1, side, count)[0])[0] for side in (-1, 1)))
-    yield "connection to a point about its cut: largest miss", row(
-        dr.max(geodesics.about_the_cut(Array3f, 1, count)[0])[0])
+    yield (
+        "connection to a point about its switch of formula: largest miss",
+        row(
+            max(
+                dr.max(geodesics.about_the_switch(Array3f, 1, side, count)[0])[0]
+                for side in (-1, 1)
+            )
+        ),
+    )
+    yield (
+        "connection to a point about its cut: largest miss",
+        row(dr.max(geodesics.about_the_cut(Array3f, 1, count)[0])[0]),
+    )
     misses = tracing.further_misses(sizes.rays(20_000))
     yield "further geodesics to a light: miss of 99 %", row(misses[len(misses) * 99 // 100])
     yield "down to 2e-4 cells from a caustic: largest miss", row(misses[-1])
@@ -285,8 +367,20 @@ def main():
     mi.set_log_level(mi.LogLevel.Error)  # sheared cylinders are meant
     print_table(METHODS, (directions, lengths, places_and_twists, crossings, tangents), sizes)
     print()
-    print_table(COLUMNS, (faces, walls, long_ways, places_and_sizes, thin_things, contacts,
-                          mirrors_and_glass, connections), sizes)
+    print_table(
+        COLUMNS,
+        (
+            faces,
+            walls,
+            long_ways,
+            places_and_sizes,
+            thin_things,
+            contacts,
+            mirrors_and_glass,
+            connections,
+        ),
+        sizes,
+    )
 
 
 if __name__ == "__main__":

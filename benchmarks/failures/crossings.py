@@ -14,8 +14,9 @@ def first_crossing(p, v, axis, c, t_max, twist=1):
     value_t = dr.value_t(type(p))
     p, v, c = type(p)(p), type(v)(v), dr.zeros(value_t, dr.width(p)) + c
     dr.eval(p, v, c)
-    t = face_crossing.first_crossing(p, v, axis, c, dr.opaque(value_t, t_max),
-                                     dr.opaque(value_t, twist))
+    t = face_crossing.first_crossing(
+        p, v, axis, c, dr.opaque(value_t, t_max), dr.opaque(value_t, twist)
+    )
     dr.eval(t)
     return t
 
@@ -39,8 +40,9 @@ def tangent_rays(count, axis, twist, t_max, seed=2):
     p, v, _ = random_rays(count, seed=seed + 1)
     p, v = Array3f64(p), Array3f64(v)
     # A frame direction without the coordinate component ``axis``
-    v = Array3f64(0 if axis == 0 else v.x, 0 if axis == 1 else v.y,
-                  -twist * p.x * v.y if axis == 2 else v.z)
+    v = Array3f64(
+        0 if axis == 0 else v.x, 0 if axis == 1 else v.y, -twist * p.x * v.y if axis == 2 else v.z
+    )
     v /= dr.norm(v)
     clearance = dr.copysign(dr.exp2(-7 - 40 * rng.next_float64()), rng.next_float64() - 0.5)
     c = p[axis] + clearance
@@ -71,13 +73,22 @@ def sign_change(name, p, v, axis, c, t_max):
         now = state["p"][axis] - c
         crossed = good & (before * now <= 0)
         found = dr.select(crossed, t + h * before / (before - now), found)
-        return (dr.select(good, dr.select(h < t_max - t, t + h, t_max), t), state,
-                dr.select(good, now, before), found)
+        return (
+            dr.select(good, dr.select(h < t_max - t, t + h, t_max), t),
+            state,
+            dr.select(good, now, before),
+            found,
+        )
 
-    state = dr.zeros(Float, dr.width(p)), steps.start(p, v), p[axis] - c, dr.full(
-        Float, math.inf, dr.width(p))
-    return dr.while_loop(state, lambda t, state, before, found: (t < t_max) & (found == math.inf),
-                         step)[3]
+    state = (
+        dr.zeros(Float, dr.width(p)),
+        steps.start(p, v),
+        p[axis] - c,
+        dr.full(Float, math.inf, dr.width(p)),
+    )
+    return dr.while_loop(
+        state, lambda t, state, before, found: (t < t_max) & (found == math.inf), step
+    )[3]
 
 
 def rays_off(found, exact, allowed=1e-3, longest=LONGEST):
@@ -102,7 +113,9 @@ def crossings_just_reached(count=100_000):
     1e-5 cells (closer, rounding decides whether they do), and where they cross them first."""
     p, v, c = tangent_rays(count, 2, 1, 12.0)
     p, v, c = Array3f(p), Array3f(v), Float(c)
-    exact, *moved = (first_crossing(Array3f64(p), Array3f64(v), 2, Float64(c) + shift, 12.0)
-                     for shift in (0, -1e-5, 1e-5))
+    exact, *moved = (
+        first_crossing(Array3f64(p), Array3f64(v), 2, Float64(c) + shift, 12.0)
+        for shift in (0, -1e-5, 1e-5)
+    )
     sure = dr.compress(dr.abs(moved[1] - moved[0]) < 0.01)
     return [dr.gather(type(x), x, sure) for x in (p, v, c, exact)]

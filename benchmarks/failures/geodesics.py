@@ -94,8 +94,14 @@ def walk(p, v, steps: UInt32, length: Float, twist: Float, chained: bool):
 
 
 def walked(p, v, t, twist, chained=False):
-    end = walk(p, v, dr.opaque(UInt32, round(t / STEP)), dr.opaque(Float, STEP),
-               dr.opaque(Float, twist), chained)
+    end = walk(
+        p,
+        v,
+        dr.opaque(UInt32, round(t / STEP)),
+        dr.opaque(Float, STEP),
+        dr.opaque(Float, twist),
+        chained,
+    )
     dr.eval(end)
     return end
 
@@ -112,15 +118,21 @@ def stepped(name, knob):
             state, h, good = steps.step(state, length - s)
             p, moved = geometry.wrap(state["p"], steps.twist)
             state = steps.behind_face(state | {"p": p}, dr.any(moved != 0))
-            return (dr.select(good, dr.select(h < length - s, s + h, length), s), state,
-                    geometry.multiply(cell, moved, k))
+            return (
+                dr.select(good, dr.select(h < length - s, s + h, length), s),
+                state,
+                geometry.multiply(cell, moved, k),
+            )
 
         count = dr.width(p)
         _, state, cell = dr.while_loop(
             (dr.zeros(Float, count), steps.start(p, v), dr.zeros(Array3i, count)),
-            lambda s, state, cell: s < length, step)
+            lambda s, state, cell: s < length,
+            step,
+        )
         dr.eval(state, cell)
         return state["p"], state["v"], cell
+
     return walked
 
 
@@ -141,6 +153,7 @@ def walk_errors(t, twist, count=4000, walked=walked):
 # ---------------------------------------------------------------------------
 #  Connections
 # ---------------------------------------------------------------------------
+
 
 def connected(vector_t, x, y, height, twist):
     """(relative miss of ``connect``'s geodesics, connections, arrival by ``flow``) from a point off

@@ -108,15 +108,21 @@ def starting_on(axis, twist, rng):
 AIMED = {
     "corner": lambda k, rng: through(lambda i, _: Array3f64(*i), k, rng),
     "edge along z": lambda k, rng: through(
-        lambda i, r: Array3f64(i[0], i[1], r.next_float64()), k, rng),
+        lambda i, r: Array3f64(i[0], i[1], r.next_float64()), k, rng
+    ),
     "edge along y": lambda k, rng: through(
-        lambda i, r: Array3f64(i[0], r.next_float64(), i[2]), k, rng),
+        lambda i, r: Array3f64(i[0], r.next_float64(), i[2]), k, rng
+    ),
     "edge along x": lambda k, rng: through(
-        lambda i, r: Array3f64(r.next_float64(), i[1], i[2]), k, rng),
+        lambda i, r: Array3f64(r.next_float64(), i[1], i[2]), k, rng
+    ),
 } | {
     f"{name} {'xyz'[axis]}": lambda k, rng, make=make, axis=axis: make(axis, k, rng)
-    for name, make in (("tangent to face", tangent), ("along face", along),
-                       ("starting on face", starting_on))
+    for name, make in (
+        ("tangent to face", tangent),
+        ("along face", along),
+        ("starting on face", starting_on),
+    )
     for axis in range(3)
 }
 
@@ -124,16 +130,25 @@ AIMED = {
 def aimed_rays(kinds, twist, count=COUNT):
     """``count`` rays of each kind, one kind after the other."""
     rays = [AIMED[kind](twist, PCG32(count, initstate=9)) for kind in kinds]
-    p, v = (Array3f(*(dr.concat([Float(dr.zeros(Float64, count) + ray[i][j]) for ray in rays])
-                      for j in range(3))) for i in range(2))
+    p, v = (
+        Array3f(
+            *(
+                dr.concat([Float(dr.zeros(Float64, count) + ray[i][j]) for ray in rays])
+                for j in range(3)
+            )
+        )
+        for i in range(2)
+    )
     dr.eval(p, v)
     return p, v
 
 
 # Three walls across the cell, and beyond it, so that what runs in a face meets no edge of them
-WALLS = [truth.Rectangle((0.6131, -0.1, -0.1), (0, 1.2, 0), (0, 0, 1.2)),
-         truth.Rectangle((-0.1, 0.4137, -0.1), (1.2, 0, 0), (0, 0, 1.2)),
-         truth.Rectangle((-0.1, -0.1, 0.3719), (1.2, 0, 0), (0, 1.2, 0))]
+WALLS = [
+    truth.Rectangle((0.6131, -0.1, -0.1), (0, 1.2, 0), (0, 0, 1.2)),
+    truth.Rectangle((-0.1, 0.4137, -0.1), (1.2, 0, 0), (0, 0, 1.2)),
+    truth.Rectangle((-0.1, -0.1, 0.3719), (1.2, 0, 0), (0, 1.2, 0)),
+]
 
 
 def walls_along_faces(axis, twist, make=package, count=COUNT):
@@ -178,17 +193,28 @@ def long_ray_errors(twist, bins, count=None, make=package):
         inside = (exact.t >= low) & (exact.t < high)
         errors = sorted(dr.gather(Float64, error, dr.compress(inside & ~other)))
         hits = dr.count(inside)[0]
-        rows.append((low, high, hits, 1 - len(errors) / max(hits, 1),
-                     *(errors[int(share * (len(errors) - 1))] if errors else math.nan
-                       for share in (0.99, 1))))
+        rows.append(
+            (
+                low,
+                high,
+                hits,
+                1 - len(errors) / max(hits, 1),
+                *(
+                    errors[int(share * (len(errors) - 1))] if errors else math.nan
+                    for share in (0.99, 1)
+                ),
+            )
+        )
     return rows
 
 
 def scaled(surfaces, size, origin):
     T = mi.ScalarTransform4f
     move = T().translate(origin).scale(size)
-    return {name: shape | {"to_world": move @ shape.get("to_world", T())}
-            for name, shape in truth.to_mitsuba(surfaces, mi).items()}
+    return {
+        name: shape | {"to_world": move @ shape.get("to_world", T())}
+        for name, shape in truth.to_mitsuba(surfaces, mi).items()
+    }
 
 
 def wrong_share_and_error(traced, exact, p, v, places):
@@ -197,8 +223,10 @@ def wrong_share_and_error(traced, exact, p, v, places):
     error = truth.across_error(p, v, exact.t, places, 1)
     error = dr.select(dr.isfinite(error), error, math.inf)
     errors = sorted(dr.gather(Float64, error, dr.compress(same & (exact.label >= 0))))
-    return (1 - dr.count(same)[0] / dr.width(p),
-            errors[int(0.99 * len(errors))] if errors else math.inf)
+    return (
+        1 - dr.count(same)[0] / dr.width(p),
+        errors[int(0.99 * len(errors))] if errors else math.inf,
+    )
 
 
 def size_errors(size, distance, count=20_000, make=package):
@@ -231,13 +259,13 @@ def far_errors(distance, count=20_000, make=package):
     # As they lie after rounding
     p, v = truth.multiply_inverse(g, Array3f64(p), 1), Array3f64(v)
     exact = truth.first_hit(walls, p, v, 12.0, 1, False)
-    return wrong_share_and_error(traced, exact, p, v,
-                                 truth.multiply_inverse(g, traced.place, 1))
+    return wrong_share_and_error(traced, exact, p, v, truth.multiply_inverse(g, traced.place, 1))
 
 
 # ---------------------------------------------------------------------------
 #  Contacts, corners, thin things
 # ---------------------------------------------------------------------------
+
 
 def grey(value):
     return {"type": "rgb", "value": value}
@@ -263,10 +291,17 @@ def lights_behind(x):
         "near": {"type": "point", "position": [x, 0.2, 0.1], "intensity": grey(10.0)},
         "far": {"type": "point", "position": [0.2, 0.3, 3.0], "intensity": grey(100.0)},
         "sky": {"type": "constant", "radiance": grey(10.0)},
-        "ball": {"type": "sphere", "center": [0.3, -x - 0.3, 0.2], "radius": 0.3,
-                 "light": lamp(100.0)},
-        "panel": {"type": "rectangle", "light": lamp(100.0),
-                  "to_world": T.translate([-x, 0, 0]).rotate([0, 1, 0], 90)},
+        "ball": {
+            "type": "sphere",
+            "center": [0.3, -x - 0.3, 0.2],
+            "radius": 0.3,
+            "light": lamp(100.0),
+        },
+        "panel": {
+            "type": "rectangle",
+            "light": lamp(100.0),
+            "to_world": T.translate([-x, 0, 0]).rotate([0, 1, 0], 90),
+        },
     }
 
 
@@ -306,8 +341,9 @@ def lit_pixels(scene, twist, quotient, spp=64, depth=6, make=package, **more):
 
 
 def closed_room(walls):
-    room = {"room": {"type": "cube", "bsdf": PLASTER}} if walls == "one surface" \
-        else thin_walls(1e-3)
+    room = (
+        {"room": {"type": "cube", "bsdf": PLASTER}} if walls == "one surface" else thin_walls(1e-3)
+    )
     return room | lights_behind(1 if walls == "one surface" else 1.001)
 
 
@@ -318,7 +354,8 @@ def leaking_pixels(walls, twist, make=package, spp=64):
 
 
 SHEETS = [truth.Rectangle((-1, -1, z), (2, 0, 0), (0, 2, 0)) for z in (0.3, 0.301)] + [
-    truth.Rectangle((x, -1, -1), (0, 2, 0), (0, 0, 2)) for x in (-0.4, -0.401)]
+    truth.Rectangle((x, -1, -1), (0, 2, 0), (0, 0, 2)) for x in (-0.4, -0.401)
+]
 
 
 def sheet_rays(count=20_000, make=package):
@@ -360,8 +397,9 @@ def off_in_a_corner(twist, make=package):
 def needles(folder, count=2000):
     """A square of 4,000 triangles, 2,000 times as long as wide."""
     vertices = [(-1 + 2 * i / count, y, 0.0) for i in range(count + 1) for y in (-1.0, 1.0)]
-    triangles = [t for i in range(0, 2 * count, 2) for t in ((i, i + 2, i + 1),
-                                                             (i + 1, i + 2, i + 3))]
+    triangles = [
+        t for i in range(0, 2 * count, 2) for t in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))
+    ]
     return write_ply(folder / "needles.ply", vertices, triangles)
 
 
@@ -386,6 +424,7 @@ def needles_passed(folder, twist, make=package, slack=1, count=50_000):
 #  Mirrors and glass
 # ---------------------------------------------------------------------------
 
+
 def off_between_mirrors(twist, depth, make=package):
     """(pixels of 1,024 that are off, energy lost by all of them) between the planes x = 1/4 and
     x = 3/4 of the quotient, which glow towards each other and are black behind: E (1 − ρⁿ)/(1 − ρ)
@@ -394,14 +433,19 @@ def off_between_mirrors(twist, depth, make=package):
     T = mi.ScalarTransform4f()
     mirrors = {
         f"mirror{towards}": {
-            "type": "rectangle", "light": lamp(emission),
+            "type": "rectangle",
+            "light": lamp(emission),
             "to_world": T.translate([x, 0.5, 0.5]).rotate([0, 1, 0], 90 * towards).scale(0.5),
             "bsdf": {"type": "conductor", "specular_reflectance": grey(albedo)},
-        } for x, towards in ((0.25, 1), (0.75, -1))
+        }
+        for x, towards in ((0.25, 1), (0.75, -1))
     }
     # A ray that stays between them for 12 cells is in equilibrium
-    scene = {**mirrors, "sensor": sensor([0.5, 0.5, 0.5], [0.75, 0.6, 0.55]),
-             "sky": {"type": "constant", "radiance": grey(emission / (1 - albedo))}}
+    scene = {
+        **mirrors,
+        "sensor": sensor([0.5, 0.5, 0.5], [0.75, 0.6, 0.55]),
+        "sky": {"type": "constant", "radiance": grey(emission / (1 - albedo))},
+    }
     image = rendered(scene, nil(twist, True, depth), 1, make)
     exact = emission * (1 - albedo**depth) / (1 - albedo)
     off = dr.count(~(dr.abs(image / exact - 1) <= 1e-4))[0] // 3
@@ -412,9 +456,11 @@ def inside_glass(twist, make=package):
     """(share of rays that are trapped, share that see the white sky other than n² times as bright)
     inside of a glass ball."""
     glass = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-    scene = {"sky": {"type": "constant", "radiance": grey(1.0)},
-             "ball": {"type": "sphere", "bsdf": glass},
-             "sensor": sensor([0, 0, 0.9], [1, 0.3, 0.9])}
+    scene = {
+        "sky": {"type": "constant", "radiance": grey(1.0)},
+        "ball": {"type": "sphere", "bsdf": glass},
+        "sensor": sensor([0, 0, 0.9], [1, 0.3, 0.9]),
+    }
     image = rendered(scene, nil(twist, False, 200), 1, make)
     trapped = image == 0
     off = ~trapped & ~(dr.abs(image / 1.5**2 - 1) < 1e-4)
@@ -424,6 +470,7 @@ def inside_glass(twist, make=package):
 # ---------------------------------------------------------------------------
 #  Beyond the cut point
 # ---------------------------------------------------------------------------
+
 
 def further_misses(count=20_000):
     """By how much geodesics of half turns between π and 4π miss a light, relative to its distance:
