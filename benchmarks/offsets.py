@@ -5,20 +5,23 @@ lead inward should meet its other side: the shares of those that do otherwise, "
 package's offset, for offsets by 8, 16 and 32 roundings of the largest number that goes into the
 hit, and for Mitsuba's own. Straight rays: the package's offset does not depend on the twist.
 
-Then the paths that leak out of a closed mesh room, and those that glass leaves with radiance that
-is off by the factor η², since they enter or leave it alone.
+Then by how much light changes far from zero, the paths that leak out of a closed mesh room, and
+those that glass leaves with radiance that is off by the factor η², since they enter or leave it
+alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import statistics
 from tempfile import NamedTemporaryFile
 from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
 
-from .studio import ALBEDO, EMISSION, ROUNDING, cube_room, nil, sensor
+from .studio import ALBEDO, EMISSION, ROUNDING, cube_room, film, nil, sensor
 
 ROUNDINGS = (8, 16, 32)
 COUNT = 100_000
@@ -223,6 +226,72 @@ def unequal_glass(twist, size=1024):
     return dr.count(off)[0] // 3, size * size
 
 
+def grey(value):
+    return {"type": "rgb", "value": value}
+
+
+def lit_room(d):
+    """A floor, a ball and a lamp under a dim sky, moved by d along all axes."""
+    T = mi.ScalarTransform4f()
+
+    def at(x, y, z):
+        return [x + d, y + d, z + d]
+
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant", "radiance": grey(0.2)},
+            "sensor": {
+                "type": "perspective",
+                "fov": 60,
+                "near_clip": 1e-3,
+                "film": film(48, 48),
+                "to_world": T.look_at(at(0.1, 0.1, 0.6), at(0.7, 1, 0.4), [0, 0, 1]),
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": T.translate(at(0.5, 0.5, 0.1)).scale(0.45),
+                "bsdf": {"type": "twosided", "b": {"type": "diffuse"}},
+            },
+            "ball": {"type": "sphere", "center": at(0.5, 0.6, 0.25), "radius": 0.15},
+            "lamp": {
+                "type": "rectangle",
+                "emitter": {"type": "area", "radiance": grey(5.0)},
+                "to_world": T.translate(at(0.5, 0.4, 0.9)).rotate([1, 0, 0], 180).scale(0.1),
+            },
+        }
+    )
+
+
+def difference_of_means(first, second, integrators, spp, passes):
+    """By what part the mean of one picture differs from that of another, with standard error."""
+    ratios = []
+    for seed in range(passes):
+        means = [
+            dr.mean(mi.render(scene, integrator=integrator, spp=spp, seed=seed).array)[0]
+            for scene, integrator in zip((first, second), integrators)
+        ]
+        ratios.append(means[0] / means[1] - 1)
+    return statistics.mean(ratios), statistics.stdev(ratios) / math.sqrt(passes)
+
+
+def moved(twist, quotient, d, spp, passes):
+    """`difference_of_means` of the lit room moved by ``d``, its cell too, and the one at home."""
+    integrators = [
+        mi.load_dict(
+            {
+                "type": "nil",
+                "twist": float(twist),
+                "quotient": quotient,
+                "max_depth": 6,
+                "cell_origin": [float(c)] * 3,
+            }
+        )
+        for c in (d, 0)
+    ]
+    return difference_of_means(lit_room(d), lit_room(0), integrators, spp, passes)
+
+
 def share(part, whole):
     return "0" if part == 0 else f"{part / whole:.1e}".replace("e-0", "e-")
 
@@ -252,6 +321,18 @@ def main():
                 + ("" if kind in ONE_SIDED else f" / {share(into, len(hits))}")
             )
         print(f"| {kind} | {where} | {len(hits):,} | " + " | ".join(shares) + " |", flush=True)
+
+    print("\n| a scene moved with its cell by | twist 0, plain: mean off by | twist 1, quotient |")
+    print("|---" * 3 + "|")
+    for d in (1000, 3000, 10_000):
+        cells = [
+            "{:+.3f} ± {:.3f} %".format(*(100 * x for x in moved(*kind, d, *size)))
+            for kind, size in (
+                ((0, False), (1 if quick else 256, 2 if quick else 8)),
+                ((1, True), (1 if quick else 256, 2 if quick else 12)),
+            )
+        ]
+        print(f"| {d:,} | " + " | ".join(cells) + " |", flush=True)
 
     print("\n| twist | pixels off in a closed room | of vertices | paths off behind glass | of |")
     print("|---" * 5 + "|")

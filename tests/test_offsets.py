@@ -1,13 +1,19 @@
 """Next rays start off the surface by its rounding: they leave it, and nothing else changes."""
 
-import math
-import statistics
-
 import drjit as dr
 import mitsuba as mi
 import pytest
 
-from benchmarks.offsets import FINE, KINDS, ONE_SIDED, PLACES, Hits
+from benchmarks.offsets import (
+    FINE,
+    KINDS,
+    ONE_SIDED,
+    PLACES,
+    Hits,
+    difference_of_means,
+    grey,
+    moved,
+)
 from benchmarks.studio import film
 
 # ------------------------------------------------------------------ leaving a surface
@@ -62,56 +68,11 @@ def test_a_sphere_does_not_shadow_itself_because_an_instance_shrinks_it(rgb, sca
 # ------------------------------------------------------------------ far from zero
 
 
-def grey(value):
-    return {"type": "rgb", "value": value}
-
-
-def lit_room(d):
-    """A floor, a ball and a lamp under a dim sky, moved by d along all axes."""
-    T = mi.ScalarTransform4f()
-
-    def at(x, y, z):
-        return [x + d, y + d, z + d]
-
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sky": {"type": "constant", "radiance": grey(0.2)},
-            "sensor": {
-                "type": "perspective",
-                "fov": 60,
-                "near_clip": 1e-3,
-                "film": film(48, 48),
-                "to_world": T.look_at(at(0.1, 0.1, 0.6), at(0.7, 1, 0.4), [0, 0, 1]),
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": T.translate(at(0.5, 0.5, 0.1)).scale(0.45),
-                "bsdf": {"type": "twosided", "b": {"type": "diffuse"}},
-            },
-            "ball": {"type": "sphere", "center": at(0.5, 0.6, 0.25), "radius": 0.15},
-            "lamp": {
-                "type": "rectangle",
-                "emitter": {"type": "area", "radiance": grey(5.0)},
-                "to_world": T.translate(at(0.5, 0.4, 0.9)).rotate([1, 0, 0], 180).scale(0.1),
-            },
-        }
-    )
-
-
-def assert_same_mean(moved, there, integrators, limit, spp, passes=12):
-    """The mean of the picture differs by at most ``limit``, or by 3.5 standard errors more (one in
-    1,000 sound tests), which are at most half of the limit."""
-    ratios = []
-    for seed in range(passes):
-        means = [
-            dr.mean(mi.render(scene, integrator=integrator, spp=spp, seed=seed).array)[0]
-            for scene, integrator in zip((moved, there), integrators)
-        ]
-        ratios.append(means[0] / means[1] - 1)
-    error = statistics.stdev(ratios) / math.sqrt(passes)
+def assert_same_mean(difference, error, limit):
+    """A mean differs by at most ``limit``, or by 3.5 standard errors more (one in 1,000 sound
+    tests), which are at most half of the limit."""
     assert error <= 0.5 * limit
-    assert abs(statistics.mean(ratios)) <= limit + 3.5 * error
+    assert abs(difference) <= limit + 3.5 * error
 
 
 @pytest.mark.parametrize(
@@ -127,19 +88,7 @@ def assert_same_mean(moved, there, integrators, limit, spp, passes=12):
 )
 def test_a_scene_far_from_zero_is_lit_as_at_home(rgb, twist, quotient, d, limit, spp):
     """Everything is moved, and ``cell_origin`` with it."""
-    here, there = (
-        mi.load_dict(
-            {
-                "type": "nil",
-                "twist": float(twist),
-                "quotient": quotient,
-                "max_depth": 6,
-                "cell_origin": [float(c)] * 3,
-            }
-        )
-        for c in (d, 0)
-    )
-    assert_same_mean(lit_room(d), lit_room(0), (here, there), limit, spp)
+    assert_same_mean(*moved(twist, quotient, d, spp, passes=12), limit)
 
 
 def test_a_lamp_close_to_a_floor_is_as_bright_far_from_zero(rgb):
@@ -167,7 +116,8 @@ def test_a_lamp_close_to_a_floor_is_as_bright_far_from_zero(rgb):
         )
 
     integrator = mi.load_dict({"type": "nil", "twist": 0.0, "quotient": False})
-    assert_same_mean(scene(1000, 2000, 500), scene(0, 0, 0), [integrator] * 2, 5e-3, 64)
+    scenes = scene(1000, 2000, 500), scene(0, 0, 0)
+    assert_same_mean(*difference_of_means(*scenes, [integrator] * 2, 64, 12), 5e-3)
 
 
 # ------------------------------------------------------------------ mirrors
