@@ -154,7 +154,7 @@ def test_a_triangle_without_a_place_is_named_and_the_others_are_seen(
         )
         image = mi.render(scene, integrator=nil, spp=1)
         pictures.append(image[:, :, 3].array)
-    assert dr.all(pictures[0] == pictures[1]) and dr.any(pictures[0] > 0)
+    assert dr.allclose(*pictures, rtol=1e-5) and dr.any(pictures[0] > 0)[0]
     warning = "1 of its 3 triangles have corners that are no numbers up to 1e15"
     assert warning in capfd.readouterr().out
 
