@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+# Two processes, since half of the tests' time is Python's; a file's tests share what they have made
+TWO    := -n 2 --dist loadfile
 
 .PHONY: render test verify lint gallery clean
 
@@ -11,10 +13,10 @@ render: $(VENV)/.installed
 	$(BIN)/nil-mitsuba render scenes/showcase.xml -o out/showcase.exr --png out/showcase.png
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest --durations=10
+	$(BIN)/python -m pytest $(TWO) --durations=10
 
 verify: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -m verify
+	$(BIN)/python -m pytest $(TWO) -m verify
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -179,7 +179,9 @@ def test_closed_room_of_the_quotient_has_the_radiance_of_a_geometric_series(
     check_room(scene, nil(twist, True, 8), 8, spp=16)
 
 
-@pytest.mark.parametrize("twist", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    "twist", [0, 3, *(pytest.param(twist, marks=pytest.mark.verify) for twist in (1, 2))]
+)
 def test_glowing_things_under_an_equally_bright_sky_are_invisible(rgb, twist):
     """In equilibrium each path has the same radiance, wherever it ends and whatever it crosses."""
     things = {

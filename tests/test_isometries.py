@@ -119,6 +119,15 @@ def cell_scene():
 PLAIN = {"type": "nil", "quotient": False, "max_depth": 4}
 QUOTIENT = {"type": "nil", "quotient": True, "max_depth": 3, "max_distance": 5.0}
 
+
+def some(moves, *names):
+    """These of the moves, and those that must show; the others with -m verify."""
+    return [
+        name if name in names or not move[-1] else pytest.param(name, marks=pytest.mark.verify)
+        for name, move in moves.items()
+    ]
+
+
 PLAIN_MOVES = {
     "along x": (translation((0.7, 0.0, 0.0), 1.3), True),
     "along y": (translation((0.0, -1.1, 0.0), 1.3), True),
@@ -132,7 +141,7 @@ PLAIN_MOVES = {
 }
 
 
-@pytest.mark.parametrize("name", PLAIN_MOVES)
+@pytest.mark.parametrize("name", some(PLAIN_MOVES, "far", "half-turn about x"))
 def test_isometries_of_plain_nil_leave_the_image_unchanged(rgb, name, tmp_path):
     """Fails on equal expectations for one seed in 400."""
     move, is_isometry = PLAIN_MOVES[name]
@@ -157,7 +166,7 @@ QUOTIENT_MOVES = {
 }
 
 
-@pytest.mark.parametrize("name", QUOTIENT_MOVES)
+@pytest.mark.parametrize("name", some(QUOTIENT_MOVES, "half a cell along x at twist 2"))
 def test_isometries_of_the_quotient_leave_the_image_unchanged(rgb, name, tmp_path):
     """Fails on equal expectations for one seed in 400."""
     twist, h, is_isometry = QUOTIENT_MOVES[name]

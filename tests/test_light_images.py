@@ -124,6 +124,11 @@ def sky():
 
 
 SPACES = [(1, False), (3, False), (0, True), (1, True), (2, True)]
+TWO_SPACES = [
+    (1, False),
+    (1, True),
+    *(pytest.param(*s, marks=pytest.mark.verify) for s in ((3, False), (0, True), (2, True))),
+]
 
 
 def compare_with_and_without(scene, twist, quotient, spp, max_depth=4, **more):
@@ -141,13 +146,13 @@ def compare_with_and_without(scene, twist, quotient, spp, max_depth=4, **more):
     assert max(map(abs, scores)) <= POOLED_Z, f"pooled z of X, Y, Z: {scores}"
 
 
-@pytest.mark.parametrize("twist, quotient", SPACES)
+@pytest.mark.parametrize("twist, quotient", TWO_SPACES)
 def test_sampling_plain_and_textured_lights_keeps_the_mean(rgb, twist, quotient):
     """Fails on equal expectations for one seed in 700."""
     compare_with_and_without(room(**panel(), **picture()), twist, quotient, spp=512)
 
 
-@pytest.mark.parametrize("twist, quotient", SPACES)
+@pytest.mark.parametrize("twist, quotient", TWO_SPACES)
 def test_sampling_round_and_mesh_lights_keeps_the_mean(rgb, twist, quotient, tmp_path):
     """Fails on equal expectations for one seed in 700."""
     compare_with_and_without(room(**bulb(), **gem(tmp_path)), twist, quotient, spp=512)
@@ -167,6 +172,7 @@ def test_sampling_every_light_keeps_the_mean_of_many_samples(rgb, twist, quotien
     compare_with_and_without(room(**lights), twist, quotient, spp=4096)
 
 
+@pytest.mark.verify
 def test_images_halfway_between_cells_keep_the_mean(rgb):
     """Floor and light half a cell apart: two images are nearest, and rounding picks one of them.
     Fails on equal expectations for one seed in 700."""
@@ -194,6 +200,7 @@ def test_images_halfway_between_cells_keep_the_mean(rgb):
     compare_with_and_without(scene, 0, True, spp=8192, max_depth=2)
 
 
+@pytest.mark.verify
 def test_sampling_weights_keep_the_mean(rgb):
     """Fails on equal expectations for one seed in 700."""
     lights = panel() | bulb()
@@ -202,6 +209,7 @@ def test_sampling_weights_keep_the_mean(rgb):
     compare_with_and_without(room(**lights), 1, True, spp=512)
 
 
+@pytest.mark.verify
 def test_lights_outside_the_cube_keep_the_mean(rgb):
     """Half of the panel lies beyond the cube, where it does not exist. Fails on equal expectations
     for one seed in 700."""
