@@ -188,6 +188,7 @@ def test_winding_floor_goes_on_from_cell_to_cell(rgb):
             assert abs(off - round(off)) < 3e-4
 
 
+@pytest.mark.verify
 def test_pictures_of_the_explanation_are_made_by_their_script(rgb, tmp_path):
     pytest.importorskip("altair")
     pytest.importorskip("vl_convert")

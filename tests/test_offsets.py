@@ -27,7 +27,14 @@ TOO_SMALL = ("instance of a sphere", "small, 3 off")
 ROUNDED = 3e-3
 
 
-@pytest.mark.parametrize("place", PLACES, ids=lambda place: place[0])
+@pytest.mark.parametrize(
+    "place",
+    [
+        place if i % 2 == 0 else pytest.param(place, marks=pytest.mark.verify)
+        for i, place in enumerate(PLACES)
+    ],
+    ids=lambda place: place[0],
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_leaves_a_convex_shape_does_not_meet_it_again(rgb, kind, place):
     """None of 100,000 rays, most of them grazing, from hits on both sides."""
@@ -78,7 +85,7 @@ def assert_same_mean(difference, error, limit):
 @pytest.mark.parametrize(
     "twist, quotient, d, limit, spp",
     [
-        *((0, False, d, limit, 64) for d, limit in ((1000, 5e-4), (3000, 5e-4), (10_000, 2e-3))),
+        *((0, False, d, limit, 64) for d, limit in ((3000, 5e-4), (10_000, 2e-3))),
         *(
             pytest.param(1, True, d, limit, 128, marks=pytest.mark.verify)
             # At 3,000 the rounding of what stands in the cell is a third of 0.28 %

@@ -75,8 +75,15 @@ def wait_for(path, process):
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("where", ["a kernel", "Python"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number, where",
+    [
+        (signal.SIGINT, "a kernel"),
+        (signal.SIGTERM, "Python"),
+        pytest.param(signal.SIGTERM, "a kernel", marks=pytest.mark.verify),
+        pytest.param(signal.SIGINT, "Python", marks=pytest.mark.verify),
+    ],
+)
 def test_a_second_signal_ends_the_command_within_three_seconds(rgb, tmp_path, number, where):
     (tmp_path / "room.xml").write_text(ROOM)
     process = subprocess.Popen(
