@@ -470,7 +470,7 @@ class Lights:
         result = mi.Float(0)
         if self.has_area:
             lit = active & hit.valid
-            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, start, v, g, lit), result)
+            result = dr.select(lit, self._pdf_area(hit, si, emitter, p, start, g, lit), result)
         environment = self.scene.environment()
         if environment is not None:
             ds = dr.zeros(mi.DirectionSample3f)
@@ -482,7 +482,7 @@ class Lights:
             return result * self.pmf
         return result * emitter.sampling_weight() * self.weight_scale
 
-    def _pdf_area(self, hit, si, emitter, p, start, v, g, active):
+    def _pdf_area(self, hit, si, emitter, p, start, g, active):
         space = self.space
         lit = active & (emitter != None)  # noqa: E711 - an array of pointers
         q = space.to_cells(si.p)
