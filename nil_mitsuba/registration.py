@@ -14,6 +14,7 @@ VARIANT_MODULES = (
     "nil_mitsuba.quotient",
     "nil_mitsuba.shapes",
     "nil_mitsuba.box",
+    "nil_mitsuba.clearance",
     "nil_mitsuba.tracer",
     "nil_mitsuba.interaction",
     "nil_mitsuba.camera",

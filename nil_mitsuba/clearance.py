@@ -1,0 +1,375 @@
+"""How far from a point there is certainly no surface: a coarse grid of a scene's empty space.
+
+The grid is filled from the shapes once per render: voxels that a surface may touch are marked, and
+each voxel is told how far any of its points is at least from any point of a marked one. In the
+quotient the marked voxels go on periodically under the group.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from . import geometry
+from .quotient import Space, opaque
+from .shapes import FAR, Shapes
+
+# Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere
+QUOTIENT_VOXELS = 48
+PLAIN_VOXELS = 2**18
+LEAST_VOXELS = 16
+# In the quotient clearances are not followed further (cells); images that far stay one cell away
+FURTHEST = 0.5
+# Surfaces are thickened by this part of a voxel, and by so much of their largest coordinate: the
+# rounding of what says in which voxel they lie, and of Embree's own arithmetic.
+THICKER, ROUNDING = 1e-3, 2**-20
+SHORT = 1 - 1e-5
+# Each is asked for its transform on its own, which takes time; boxes have to do for further ones
+MOST_TRANSFORMS = 1000
+
+
+class Clearance:
+    """Distances (cells) within which certainly no surface lies, by voxels.
+
+    ``box`` (scene units) is what of plain space is looked at; that of all shapes if it is None.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        space: Space,
+        shapes: Shapes,
+        box: mi.ScalarBoundingBox3f | None = None,
+        voxels: int | None = None,
+    ):
+        self.space = space
+        if space.quotient:
+            n = voxels or QUOTIENT_VOXELS
+            self.counts = (n, n, n)
+            self.lower, self.upper = mi.Point3f(0), mi.Point3f(1)
+            edges = [1 / n] * 3
+        else:
+            box = box or shapes.box
+            if not box.valid():
+                box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
+            extents = [float(x) / space.size_number for x in box.extents()]
+            self.counts = _counts(extents, voxels**3 if voxels else PLAIN_VOXELS)
+            self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
+            self.upper = space.to_cells(opaque(mi.Point3f(box.max)))
+            # A flat box has one layer of voxels without a height
+            edges = [x / n for x, n in zip(extents, self.counts)]
+        self.edges = opaque(mi.Vector3f(edges))
+        per_cell = [1 / edge if edge > 0 else 0 for edge in edges]
+        self.per_cell = opaque(mi.Vector3f(per_cell))
+        nx, ny, nz = self.counts
+        self.last = opaque(mi.Vector3f(nx - 1, ny - 1, nz - 1))
+        self.stride = opaque(mi.Vector3u(1, nx, nx * ny))
+        largest = max(abs(float(c)) for c in (*shapes.box.min, *shapes.box.max))
+        self.slack = space.slack + opaque(
+            mi.Float(ROUNDING * (largest if math.isfinite(largest) else 0) / space.size_number)
+        )
+
+        self._table = dr.full(mi.Float, FURTHEST**2 if space.quotient else 1e30, nx * ny * nz)
+        dr.make_opaque(self._table)
+        self._mark(shapes)
+        self._spread()
+
+    # ------------------------------------------------------------------ looking up
+
+    def at(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float:
+        """The clearance (cells) at ``p`` (cells): in the unit cube, or anywhere in plain Nil."""
+        voxel = dr.clip((p - self.lower) * self.per_cell, 0, self.last)
+        index = dr.dot(mi.Vector3u(voxel), self.stride)
+        inside = dr.gather(mi.Float, self.table, index, active)
+        if self.space.quotient:
+            return inside
+        # What lies in the box is seen from p at no less than a right angle over its nearest point
+        outside = dr.squared_norm(p - dr.clip(p, self.lower, self.upper))
+        return dr.select(outside > 0, dr.sqrt(dr.fma(inside, inside, outside)) * SHORT, inside)
+
+    def leap(self, p: mi.Point3f, v: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
+        """Arc length (cells) for which the geodesic from ``p`` along ``v`` meets nothing."""
+        return within(p, v, self.at(p, active), self.space.twist)
+
+    # ------------------------------------------------------------------ building
+
+    def _to_voxels(self, p):
+        return (self.space.to_cells(p) - self.lower) * self.per_cell
+
+    def _mark(self, shapes):
+        """Mark the voxels that surfaces may touch."""
+        meshes = [shape for shape in shapes.shapes if shape.is_mesh()]
+        triangles = [_triangles(meshes)] if meshes else []
+        lumps, flat = [], []
+        for shape, extent in zip(shapes.shapes, shapes.extents):
+            if shape.is_mesh() or not extent.box.valid():
+                continue
+            kind = shape.shape_type()
+            if kind in FLAT and len(flat) < MOST_TRANSFORMS:
+                flat.append(_to_world(shape))
+            else:
+                hollow = kind == int(mi.ShapeType.Sphere)
+                lumps.append((*extent.box.min, *extent.box.max, float(hollow)))
+        if flat:
+            triangles.append(_squares(flat))
+        for corners in triangles:
+            self._mark_triangles(*corners)
+        if lumps:
+            columns = [opaque(mi.Float(column)) for column in zip(*lumps)]
+            self._mark_lumps(mi.Point3f(columns[:3]), mi.Point3f(columns[3:6]), columns[6] > 0)
+
+    @dr.syntax
+    def _mark_triangles(self, a: mi.Point3f, b: mi.Point3f, c: mi.Point3f):
+        """Mark the voxels that triangles (scene units) may touch.
+
+        In units of voxels: for each column of them along the axis that is nearest to the normal,
+        which lies over the triangle, those between the lowest and the highest point of the plane.
+        """
+        finite = dr.all((dr.abs(a) < FAR) & (dr.abs(b) < FAR) & (dr.abs(c) < FAR))
+        a, b, c = self._to_voxels(a), self._to_voxels(b), self._to_voxels(c)
+        low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
+        thicker = dr.fma(ROUNDING, dr.max(dr.maximum(dr.abs(low), dr.abs(high))), THICKER)
+        low, high = low - thicker, high + thicker
+        met = finite & dr.all((high >= 0) & (low <= self.last + 1))
+        first, last = (mi.Vector3i(dr.clip(x, 0, self.last)) for x in (low, high))
+
+        n = dr.cross(b - a, c - a)
+        steep = dr.abs(n)
+        on_x = (steep.x >= steep.y) & (steep.x >= steep.z)
+        on_y = ~on_x & (steep.y >= steep.z)
+
+        def turned(q):
+            """Coordinates with the axis of the columns last."""
+            return type(q)(
+                dr.select(on_x, q.y, dr.select(on_y, q.z, q.x)),
+                dr.select(on_x, q.z, dr.select(on_y, q.x, q.y)),
+                dr.select(on_x, q.x, dr.select(on_y, q.y, q.z)),
+            )
+
+        a, b, c, n = turned(a), turned(b), turned(c), turned(n)
+        first, last, stride = turned(first), turned(last), turned(mi.Vector3i(self.stride))
+        bottom, top = turned(low).z, turned(high).z
+        # Depth of the plane over the point a; a triangle without area is bounded by its box alone
+        inverse = dr.rcp(n.z)
+        slope_x, slope_y = -n.x * inverse, -n.y * inverse
+        plane = n.z != 0
+        half = dr.fma(0.5 + thicker, dr.abs(slope_x) + dr.abs(slope_y), 2 * thicker)
+
+        # Over the triangle: inward of its three edges, by the farthest corner of a column
+        sides = []
+        for p, q in ((a, b), (b, c), (c, a)):
+            ex, ey = q.y - p.y, p.x - q.x
+            inward = dr.select(n.z > 0, -1.0, 1.0)
+            ex, ey = inward * ex, inward * ey
+            reach = (0.5 + thicker) * (dr.abs(ex) + dr.abs(ey))
+            sides.append((p, ex, ey, reach))
+
+        i, j = mi.Int32(first.x), mi.Int32(first.y)
+        looking = mi.Bool(met)
+        while looking:
+            x, y = mi.Float(i) + 0.5, mi.Float(j) + 0.5
+            outside = mi.Bool(False)
+            for p, ex, ey, reach in sides:
+                outside |= dr.fma(x - p.x, ex, (y - p.y) * ey) + reach < 0
+            depth = dr.fma(x - a.x, slope_x, dr.fma(y - a.y, slope_y, a.z))
+            from_, to = dr.maximum(bottom, depth - half), dr.minimum(top, depth + half)
+            from_, to = dr.select(plane, from_, bottom), dr.select(plane, to, top)
+            level = dr.maximum(mi.Int32(dr.floor(from_)), first.z)
+            end = dr.minimum(mi.Int32(dr.floor(to)), last.z)
+            end = dr.select(outside & plane, -1, end)
+            column = i * stride.x + j * stride.y
+            while level <= end:
+                dr.scatter(self._table, mi.Float(0), mi.UInt32(column + level * stride.z))
+                level += 1
+            i += 1
+            row = i > last.x
+            i = dr.select(row, first.x, i)
+            j = dr.select(row, j + 1, j)
+            looking &= j <= last.y
+
+    @dr.syntax
+    def _mark_lumps(self, low: mi.Point3f, high: mi.Point3f, hollow: mi.Bool):
+        """Mark the voxels that boxes (scene units) fill, or the spheres in them touch."""
+        low, high = self.space.to_cells(low), self.space.to_cells(high)
+        centre, radius = 0.5 * (low + high), 0.5 * (high.x - low.x)
+        thicker = dr.fma(
+            ROUNDING,
+            dr.max(dr.maximum(dr.abs(low), dr.abs(high))),
+            THICKER * dr.max(self.edges),
+        )
+        low, high = (
+            (low - thicker - self.lower) * self.per_cell,
+            (high + thicker - self.lower) * self.per_cell,
+        )
+        met = dr.all((high >= 0) & (low <= self.last + 1))
+        first, last = (mi.Vector3i(dr.clip(x, 0, self.last)) for x in (low, high))
+        inner, outer = radius - thicker, radius + thicker
+        half = 0.5 * self.edges
+        at = mi.Vector3i(first)
+        looking = mi.Bool(met)
+        while looking:
+            voxel = dr.abs(self.lower + (mi.Vector3f(at) + 0.5) * self.edges - centre)
+            nearest = dr.norm(dr.maximum(voxel - half, 0))
+            farthest = dr.norm(voxel + half)
+            touched = ~hollow | ~((nearest > outer) | (farthest < inner))
+            dr.scatter(
+                self._table, mi.Float(0), dr.dot(mi.Vector3u(at), self.stride), looking & touched
+            )
+            at.x += 1
+            row = at.x > last.x
+            at.x = dr.select(row, first.x, at.x)
+            at.y = dr.select(row, at.y + 1, at.y)
+            layer = at.y > last.y
+            at.y = dr.select(layer, first.y, at.y)
+            at.z = dr.select(layer, at.z + 1, at.z)
+            looking &= at.z <= last.z
+
+    def _spread(self):
+        """From marked voxels to distances: squares of them along one axis after the other."""
+        nx, ny, nz = self.counts
+        edge = self.edges
+        quotient = self.space.quotient
+        if quotient:
+            # Copies on both sides in x; z and y are periodic there as well, since the twist is an
+            # integer: (x, y + 1, z) follows from (x - 1, y + 1, z - k y - k).
+            reach = min(int(FURTHEST * nx), nx)
+            table, wide = self._extended(reach)
+        else:
+            table, wide = self._table, nx
+        table = _along_axis(table, wide * ny, nz, edge.z, quotient)
+        table = _along_axis(table, wide, ny, edge.y, quotient)
+        table = _along_axis(table, 1, wide, edge.x, False)
+        if quotient:
+            index = dr.arange(mi.UInt32, nx * ny * nz)
+            row, column = index // opaque(mi.UInt32(nx)), index % opaque(mi.UInt32(nx))
+            table = dr.gather(
+                mi.Float,
+                table,
+                dr.fma(row, opaque(mi.UInt32(wide)), column + opaque(mi.UInt32(reach))),
+            )
+        self.table = dr.maximum(SHORT * dr.sqrt(table) - self.slack, 0)
+        dr.eval(self.table)
+        del self._table
+
+    @dr.syntax
+    def _extended(self, reach):
+        """The marked voxels and, on both sides in x, ``reach`` voxels of their copies there."""
+        nx, ny, nz = self.counts
+        wide = nx + 2 * reach
+        n, twist = opaque(mi.Int32(nx)), self.space.integer_twist
+        index = mi.Int32(dr.arange(mi.UInt32, wide * ny * nz))
+        across = opaque(mi.Int32(wide))
+        x, y, z = index % across, (index // across) % n, index // (across * n)
+        x -= opaque(mi.Int32(reach))
+        cell = dr.select(x < 0, -1, dr.select(x >= n, mi.Int32(1), 0))
+        # Over a voxel's height in y the copies are sheared by k voxels
+        shear = twist * cell
+        level = z - shear * y - dr.maximum(shear, 0)
+        end = z - shear * y - dr.minimum(shear, 0)
+        result = mi.Float(FURTHEST**2)
+        while level <= end:
+            row = ((level % n + n) % n * n + y) * n + x - cell * n
+            result = dr.minimum(result, dr.gather(mi.Float, self._table, mi.UInt32(row)))
+            level += 1
+        dr.eval(result)
+        return result, wide
+
+
+@dr.syntax
+def _along_axis(table: mi.Float, stride: int, count: int, edge: mi.Float, periodic: bool):
+    """Least sum of an entry and the squared gap to it along one axis, from each voxel."""
+    stride, count = opaque(mi.Int32(stride)), opaque(mi.Int32(count))
+    index = mi.Int32(dr.arange(mi.UInt32, dr.width(table)))
+    here = (index // stride) % count
+    best = dr.gather(mi.Float, table, mi.UInt32(index))
+    step = mi.Int32(1)
+    gap = mi.Float(0)
+    while (step < count) & (dr.square(gap) < best):
+        for sign in (1, -1):
+            there = here + sign * step
+            if dr.hint(periodic, mode="scalar"):
+                wrapped = dr.select(
+                    there < 0, there + count, dr.select(there >= count, there - count, there)
+                )
+                inside = mi.Bool(True)
+            else:
+                wrapped = mi.Int32(there)
+                inside = (there >= 0) & (there < count)
+            other = dr.gather(mi.Float, table, mi.UInt32(index + (wrapped - here) * stride), inside)
+            best = dr.minimum(best, dr.select(inside, dr.fma(gap, gap, other), dr.inf))
+        gap += edge
+        step += 1
+    dr.eval(best)
+    return best
+
+
+def within(p: mi.Point3f, v: mi.Vector3f, clearance: mi.Float, twist: mi.Float) -> mi.Float:
+    """Arc length for which the geodesic at ``p`` in direction ``v`` keeps within ``clearance``.
+
+    All in cells. It is at most ``speed`` s + M s²/2 off after s, where M bounds its acceleration
+    k (−w b, w a, a (b + k x w)): b − k x w is conserved, and x moves by no more than the clearance.
+    """
+    velocity = geometry.from_frame(p, v, twist)
+    speed2 = dr.squared_norm(velocity)
+    kw = dr.abs(twist * v.z)
+    c2 = dr.fma(v.x, v.x, v.y * v.y)
+    lean = dr.fma(2 * kw, clearance, dr.abs(dr.fma(twist * v.z, p.x, v.y)))
+    most = dr.abs(twist) * dr.sqrt(c2 * dr.fma(lean, lean, v.z * v.z))
+    speed = dr.sqrt(speed2)
+    return 2 * SHORT * clearance / (speed + dr.sqrt(dr.fma(2 * most, clearance, speed2)))
+
+
+def _counts(extents, total):
+    """Voxels along the edges of a box: about cubes, but no fewer than a few layers."""
+    counts = [0 if x > 0 else 1 for x in extents]
+    while 0 in counts:
+        free = [i for i, n in enumerate(counts) if n == 0]
+        room = total / math.prod(n for n in counts if n)
+        edge = math.prod(extents[i] for i in free) ** (1 / len(free)) / room ** (1 / len(free))
+        thin = [i for i in free if extents[i] < LEAST_VOXELS * edge]
+        if thin:
+            counts[min(thin, key=lambda i: extents[i])] = LEAST_VOXELS
+            continue
+        for i in free:
+            counts[i] = max(1, int(extents[i] / edge))
+    return tuple(counts)
+
+
+FLAT = (int(mi.ShapeType.Rectangle), int(mi.ShapeType.Disk))
+
+
+def _to_world(shape):
+    return mi.traverse(shape)["to_world"].matrix
+
+
+def _squares(matrices):
+    """Corners (scene units) of the two triangles of each square [−1, 1]² in the plane z = 0."""
+    columns = [
+        opaque(mi.Point3f([dr.concat([mi.Float(m[i, j]) for m in matrices]) for i in range(3)]))
+        for j in (0, 1, 3)
+    ]
+    u, v, centre = columns
+    a, b, c, d = centre - u - v, centre + u - v, centre + u + v, centre - u + v
+    return [_together(pair) for pair in ((a, a), (b, c), (c, d))]
+
+
+def _triangles(meshes):
+    """Corners (scene units) of the triangles of meshes."""
+    parts = []
+    for mesh in meshes:
+        positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
+        triangle = dr.arange(mi.UInt32, mesh.face_count())
+        parts.append(
+            [
+                dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
+                for i in range(3)
+            ]
+        )
+    # One mesh is read where it lies
+    return parts[0] if len(parts) == 1 else [_together(corners) for corners in zip(*parts)]
+
+
+def _together(points):
+    return mi.Point3f([dr.concat([p[i] for p in points]) for i in range(3)])
