@@ -102,7 +102,8 @@ class Clearance:
         """Mark the voxels that surfaces may touch."""
         meshes = [shape for shape in shapes.shapes if shape.is_mesh()]
         triangles = [_triangles(meshes)] if meshes else []
-        lumps, flat = [], []
+        lumps: list[tuple[float, ...]] = []
+        flat: list[mi.Matrix4f] = []
         for shape, extent in zip(shapes.shapes, shapes.extents):
             if shape.is_mesh() or not extent.box.valid():
                 continue
