@@ -20,6 +20,8 @@ from .shapes import FAR, Shapes
 QUOTIENT_VOXELS = 48
 PLAIN_VOXELS = 2**18
 LEAST_VOXELS = 16
+# Grids around the focus: voxels along an edge, edge (cells) of the finest ones, and how many
+FOCUS_VOXELS, FINEST, MOST_LEVELS = 32, 1 / 32, 16
 WORTHWHILE = 0.02  # cells, in the mean
 # In the quotient clearances are not followed further (cells); images that far stay one cell away
 FURTHEST = 0.5
@@ -41,63 +43,100 @@ CURVES = (LINEAR, BSPLINE)
 class Clearance:
     """Distances (cells) within which certainly no surface lies, by voxels.
 
-    ``box`` (scene units) is what of plain space is looked at; that of all shapes if it is None.
+    In plain Nil the grid is that of the shapes' box. Around ``focus`` (scene units), where the
+    camera is, there are finer ones, each half as large as the next: what is near is small.
     """
 
     def __init__(
         self,
-        scene: mi.Scene,
         space: Space,
         shapes: Shapes,
-        box: mi.ScalarBoundingBox3f | None = None,
+        focus: mi.ScalarPoint3f | None = None,
         voxels: int | None = None,
     ):
         self.space = space
+        size = space.size_number
+        box = shapes.box if shapes.box.valid() else mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
+        largest = max(abs(float(c)) for c in (*box.min, *box.max))
+        self.slack = space.slack + opaque(mi.Float(ROUNDING * largest / size))
+        self.levels = 0
         if space.quotient:
             n = voxels or QUOTIENT_VOXELS
-            self.counts = (n, n, n)
-            self.lower, self.upper = mi.Point3f(0), mi.Point3f(1)
-            edges = [1 / n] * 3
+            self.grid = _Grid(space, shapes, mi.Point3f(0), [1 / n] * 3, (n, n, n))
+            self.table = opaque(dr.maximum(self.grid.least - self.slack, 0))
         else:
-            box = box or shapes.box
-            if not box.valid():
-                box = mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
-            extents = [float(x) / space.size_number for x in box.extents()]
-            self.counts = _counts(extents, voxels**3 if voxels else PLAIN_VOXELS)
+            extents = [float(x) / size for x in box.extents()]
+            counts = _counts(extents, voxels**3 if voxels else PLAIN_VOXELS)
+            # A flat box has one layer of voxels without a height
+            edges = [x / n for x, n in zip(extents, counts)]
             self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
             self.upper = space.to_cells(opaque(mi.Point3f(box.max)))
-            # A flat box has one layer of voxels without a height
-            edges = [x / n for x, n in zip(extents, self.counts)]
-        self.edges = opaque(mi.Vector3f(edges))
-        per_cell = [1 / edge if edge > 0 else 0 for edge in edges]
-        self.per_cell = opaque(mi.Vector3f(per_cell))
-        nx, ny, nz = self.counts
-        self.last = opaque(mi.Vector3f(nx - 1, ny - 1, nz - 1))
-        self.stride = opaque(mi.Vector3u(1, nx, nx * ny))
-        largest = max(abs(float(c)) for c in (*shapes.box.min, *shapes.box.max))
-        self.slack = space.slack + opaque(
-            mi.Float(ROUNDING * (largest if math.isfinite(largest) else 0) / space.size_number)
-        )
-
-        self._table = dr.full(mi.Float, FURTHEST**2 if space.quotient else 1e30, nx * ny * nz)
-        dr.make_opaque(self._table)
-        self._mark(shapes)
-        self._spread()
+            self.grid = _Grid(space, shapes, self.lower, edges, counts)
+            finest, levels = _levels(box, focus, size, max(edges))
+            entries = math.prod(counts) + levels * FOCUS_VOXELS**3
+            self.table = dr.empty(mi.Float, entries)
+            self._keep(0, dr.maximum(self.grid.least - self.slack, 0))
+            if levels:
+                self._add_levels(shapes, focus, finest, levels)
         # Whether it is worth asking: the alternative are chords of about a twentieth of a cell
         self.useful = dr.mean(self.table)[0] > WORTHWHILE
+
+    def _keep(self, place, values):
+        index = dr.arange(mi.UInt32, dr.width(values)) + opaque(mi.UInt32(place))
+        dr.scatter(self.table, values, index)
+        dr.eval(self.table)
+
+    def _add_levels(self, shapes, focus, finest, levels):
+        n = FOCUS_VOXELS
+        self.focus = self.space.to_cells(opaque(mi.Point3f(focus)))
+        self.per_half = opaque(mi.Float(2 / (n * finest)))
+        self.first = opaque(mi.Int32(levels))  # none of them holds anything yet
+        self.count = opaque(mi.Int32(levels))
+        self.base = opaque(mi.UInt32(math.prod(self.grid.counts)))
+        self.levels = levels
+        for level in reversed(range(levels)):
+            edge = finest * 2**level
+            lower = self.focus - opaque(mi.Float(0.5 * n * edge))
+            grid = _Grid(self.space, shapes, lower, [edge] * 3, (n, n, n))
+            # What lies beyond it is no closer than its end, and no closer than the others say
+            voxel = grid.places()
+            end = dr.min(dr.minimum(voxel, grid.last - voxel)) * grid.edges.x
+            least = dr.maximum(dr.minimum(grid.least, end) - self.slack, 0)
+            centre = lower + (mi.Vector3f(voxel) + 0.5) * grid.edges
+            others = self.at(centre) - (0.5 + THICKER) * dr.norm(grid.edges)
+            values = dr.maximum(least, others)
+            dr.eval(values)
+            self._keep(math.prod(self.grid.counts) + level * n**3, values)
+            self.first = opaque(mi.Int32(level))
 
     # ------------------------------------------------------------------ looking up
 
     def at(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float:
         """The clearance (cells) at ``p`` (cells): in the unit cube, or anywhere in plain Nil."""
-        voxel = dr.clip((p - self.lower) * self.per_cell, 0, self.last)
-        index = dr.dot(mi.Vector3u(voxel), self.stride)
-        inside = dr.gather(mi.Float, self.table, index, active)
+        grid = self.grid
+        index = grid.index(p)
         if self.space.quotient:
-            return inside
+            return dr.gather(mi.Float, self.table, index, active)
+        inner = mi.Bool(False)
+        if self.levels:
+            # The level that holds p is the exponent of its distance from the focus
+            n = FOCUS_VOXELS
+            offset = p - self.focus
+            ratio = self.per_half * dr.max(dr.abs(offset))
+            bits = dr.reinterpret_array(mi.Int32, dr.maximum(ratio, 0.25)) >> 23
+            level = dr.maximum(bits - 126, self.first)
+            inner = level < self.count
+            # Half a level's voxels per half of its size, which is 2^level of the finest
+            scale = dr.reinterpret_array(mi.Float, (127 - dr.minimum(level, 60)) << 23)
+            scale *= 0.5 * n * self.per_half
+            voxel = mi.Vector3u(dr.clip(dr.fma(offset, scale, 0.5 * n), 0, n - 1))
+            place = ((mi.UInt32(level) * n + voxel.z) * n + voxel.y) * n + voxel.x
+            index = dr.select(inner, self.base + place, index)
+        inside = dr.gather(mi.Float, self.table, index, active)
         # What lies in the box is seen from p at no less than a right angle over its nearest point
         outside = dr.squared_norm(p - dr.clip(p, self.lower, self.upper))
-        return dr.select(outside > 0, dr.sqrt(dr.fma(inside, inside, outside)) * SHORT, inside)
+        distance = SHORT * dr.sqrt(dr.fma(inside, inside, outside)) - self.slack
+        return dr.select((outside > 0) & ~inner, dr.maximum(distance, 0), inside)
 
     def leap(self, p: mi.Point3f, v: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
         """Arc length (cells) for which the geodesic from ``p`` along ``v`` meets nothing.
@@ -107,10 +146,43 @@ class Clearance:
         """
         return within(p, v, self.at(p, active), self.space.twist)
 
-    # ------------------------------------------------------------------ building
+
+class _Grid:
+    """A grid of ``counts`` voxels with ``edges`` (cells) from the corner ``lower`` (cells) on.
+
+    ``least`` is how far any point of a voxel is at least from any of the shapes' points in it, and
+    in the quotient in its copies. Elsewhere what lies outside of the grid is not seen.
+    """
+
+    def __init__(self, space, shapes, lower, edges, counts):
+        self.space = space
+        self.counts = counts
+        self.lower = lower
+        self.edges = opaque(mi.Vector3f(edges))
+        self.per_cell = opaque(mi.Vector3f([1 / edge if edge > 0 else 0 for edge in edges]))
+        nx, ny, nz = counts
+        self.last = opaque(mi.Vector3f(nx - 1, ny - 1, nz - 1))
+        self.stride = opaque(mi.Vector3u(1, nx, nx * ny))
+        # Squares of distances in the making: 0 where a surface may be
+        self._table = dr.full(mi.Float, FURTHEST**2 if space.quotient else 1e30, nx * ny * nz)
+        dr.make_opaque(self._table)
+        self._mark(shapes)
+        self.least = self._spread()
+        del self._table
+
+    def index(self, p: mi.Point3f) -> mi.UInt32:
+        """The voxel that holds ``p`` (cells), or the closest one."""
+        return dr.dot(mi.Vector3u(dr.clip(self._to_voxels(p), 0, self.last)), self.stride)
+
+    def places(self) -> mi.Vector3i:
+        """Each voxel's place in the grid."""
+        index = dr.arange(mi.UInt32, math.prod(self.counts))
+        row = index // self.stride.y
+        ny = opaque(mi.UInt32(self.counts[1]))
+        return mi.Vector3i(index - row * self.stride.y, row % ny, row // ny)
 
     def _to_voxels(self, p):
-        return (self.space.to_cells(p) - self.lower) * self.per_cell
+        return (p - self.lower) * self.per_cell
 
     def _mark(self, shapes):
         """Mark the voxels that surfaces may touch."""
@@ -158,7 +230,7 @@ class Clearance:
         which lies over the triangle, those between the lowest and the highest point of the plane.
         """
         finite = dr.all((dr.abs(a) < FAR) & (dr.abs(b) < FAR) & (dr.abs(c) < FAR))
-        a, b, c = self._to_voxels(a), self._to_voxels(b), self._to_voxels(c)
+        a, b, c = (self._to_voxels(self.space.to_cells(x)) for x in (a, b, c))
         low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         thicker = dr.fma(ROUNDING, dr.max(dr.maximum(dr.abs(low), dr.abs(high))), THICKER)
         low, high = low - thicker, high + thicker
@@ -289,9 +361,7 @@ class Clearance:
                 table,
                 dr.fma(row, opaque(mi.UInt32(wide)), column + opaque(mi.UInt32(reach))),
             )
-        self.table = dr.maximum(SHORT * dr.sqrt(table) - self.slack, 0)
-        dr.eval(self.table)
-        del self._table
+        return SHORT * dr.sqrt(table)
 
     @dr.syntax
     def _extended(self, reach):
@@ -375,6 +445,20 @@ def _counts(extents, total):
         for i in free:
             counts[i] = max(1, int(extents[i] / edge))
     return tuple(counts)
+
+
+def _levels(box, focus, size, coarsest):
+    """Edge (cells) of the voxels of the finest grid around ``focus``, and how many grids there are
+    up to one with voxels about as large as ``coarsest``."""
+    if focus is None:
+        return FINEST, 0
+    away = max(max(a - x, x - b, 0) for a, b, x in zip(box.min, box.max, focus)) / size
+    edge, levels = FINEST, 0
+    while edge * FOCUS_VOXELS < 4 * away:  # it would hold little of the box
+        edge *= 2
+    while edge * 2**levels < coarsest / 1.5 and levels < MOST_LEVELS:
+        levels += 1
+    return edge, levels
 
 
 def _columns(shape):

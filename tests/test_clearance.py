@@ -50,13 +50,13 @@ def ground():
     return scene
 
 
-def clearance_of(scene, twist=1.0, quotient=True, origin=(0, 0, 0), size=1.0):
+def clearance_of(scene, twist=1.0, quotient=True, origin=(0, 0, 0), size=1.0, focus=None):
     from nil_mitsuba.clearance import Clearance
     from nil_mitsuba.quotient import Space
     from nil_mitsuba.shapes import Shapes
 
     space = Space(twist, quotient, list(origin), size)
-    return Clearance(scene, space, Shapes(scene))
+    return Clearance(space, Shapes(scene), focus)
 
 
 def points_in(low, high, seed, count=POINTS):
