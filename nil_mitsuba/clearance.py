@@ -17,14 +17,15 @@ from .quotient import Space, opaque
 from .shapes import FAR, Shapes
 
 # Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere
-QUOTIENT_VOXELS = 48
+QUOTIENT_VOXELS = 56
 PLAIN_VOXELS = 2**18
 LEAST_VOXELS = 16
 # Grids around the focus: voxels along an edge, edge (cells) of the finest ones, and how many
-FOCUS_VOXELS, FINEST, MOST_LEVELS = 32, 1 / 32, 16
+FOCUS_VOXELS, FINEST, MOST_LEVELS = 48, 1 / 32, 16
 WORTHWHILE = 0.02  # cells, in the mean
-# In the quotient clearances are not followed further (cells); images that far stay one cell away
-FURTHEST = 0.5
+# Clearances are not followed further: in the quotient (cells), where farther copies are not
+# looked at, and elsewhere (voxels along the longest edge of one)
+FURTHEST, MOST_STEPS = 0.25, 12
 # Surfaces are thickened by this part of a voxel, and by so much of their largest coordinate: the
 # rounding of what says in which voxel they lie, and of Embree's own arithmetic.
 THICKER, ROUNDING = 1e-3, 2**-20
@@ -60,9 +61,10 @@ class Clearance:
         largest = max(abs(float(c)) for c in (*box.min, *box.max))
         self.slack = space.slack + opaque(mi.Float(ROUNDING * largest / size))
         self.levels = 0
+        pieces = _Pieces(shapes)
         if space.quotient:
             n = voxels or QUOTIENT_VOXELS
-            self.grid = _Grid(space, shapes, mi.Point3f(0), [1 / n] * 3, (n, n, n))
+            self.grid = _Grid(space, pieces, mi.Point3f(0), [1 / n] * 3, (n, n, n))
             self.table = opaque(dr.maximum(self.grid.least - self.slack, 0))
         else:
             extents = [float(x) / size for x in box.extents()]
@@ -71,13 +73,13 @@ class Clearance:
             edges = [x / n for x, n in zip(extents, counts)]
             self.lower = space.to_cells(opaque(mi.Point3f(box.min)))
             self.upper = space.to_cells(opaque(mi.Point3f(box.max)))
-            self.grid = _Grid(space, shapes, self.lower, edges, counts)
+            self.grid = _Grid(space, pieces, self.lower, edges, counts)
             finest, levels = _levels(box, focus, size, max(edges))
             entries = math.prod(counts) + levels * FOCUS_VOXELS**3
             self.table = dr.empty(mi.Float, entries)
             self._keep(0, dr.maximum(self.grid.least - self.slack, 0))
             if levels:
-                self._add_levels(shapes, focus, finest, levels)
+                self._add_levels(pieces, focus, finest, levels)
         # Whether it is worth asking: the alternative are chords of about a twentieth of a cell
         self.useful = dr.mean(self.table)[0] > WORTHWHILE
 
@@ -86,7 +88,7 @@ class Clearance:
         dr.scatter(self.table, values, index)
         dr.eval(self.table)
 
-    def _add_levels(self, shapes, focus, finest, levels):
+    def _add_levels(self, pieces, focus, finest, levels):
         n = FOCUS_VOXELS
         self.focus = self.space.to_cells(opaque(mi.Point3f(focus)))
         self.per_half = opaque(mi.Float(2 / (n * finest)))
@@ -97,7 +99,7 @@ class Clearance:
         for level in reversed(range(levels)):
             edge = finest * 2**level
             lower = self.focus - opaque(mi.Float(0.5 * n * edge))
-            grid = _Grid(self.space, shapes, lower, [edge] * 3, (n, n, n))
+            grid = _Grid(self.space, pieces, lower, [edge] * 3, (n, n, n))
             # What lies beyond it is no closer than its end, and no closer than the others say
             voxel = grid.places()
             end = dr.min(dr.minimum(voxel, grid.last - voxel)) * grid.edges.x
@@ -154,7 +156,7 @@ class _Grid:
     in the quotient in its copies. Elsewhere what lies outside of the grid is not seen.
     """
 
-    def __init__(self, space, shapes, lower, edges, counts):
+    def __init__(self, space, pieces, lower, edges, counts):
         self.space = space
         self.counts = counts
         self.lower = lower
@@ -164,9 +166,13 @@ class _Grid:
         self.last = opaque(mi.Vector3f(nx - 1, ny - 1, nz - 1))
         self.stride = opaque(mi.Vector3u(1, nx, nx * ny))
         # Squares of distances in the making: 0 where a surface may be
-        self._table = dr.full(mi.Float, FURTHEST**2 if space.quotient else 1e30, nx * ny * nz)
+        self.furthest = FURTHEST if space.quotient else MOST_STEPS * max(edges)
+        self._table = dr.full(mi.Float, 1, nx * ny * nz) * opaque(mi.Float(self.furthest**2))
         dr.make_opaque(self._table)
-        self._mark(shapes)
+        for corners in pieces.triangles:
+            self._mark_triangles(*corners)
+        for rods in pieces.rods:
+            self._mark_rods(*rods)
         self.least = self._spread()
         del self._table
 
@@ -183,44 +189,6 @@ class _Grid:
 
     def _to_voxels(self, p):
         return (p - self.lower) * self.per_cell
-
-    def _mark(self, shapes):
-        """Mark the voxels that surfaces may touch."""
-        rods: list[tuple[float, ...]] = []
-        squares: list[tuple[float, ...]] = []
-        meshes = [shape for shape in shapes.shapes if shape.is_mesh()]
-        meshes = sorted(meshes, key=lambda mesh: -mesh.face_count())[:MOST_MESHES]
-        for mesh in meshes:
-            self._mark_triangles(*_triangles(mesh))
-        for shape, extent in zip(shapes.shapes, shapes.extents):
-            box = extent.box
-            if shape in meshes or not box.valid():
-                continue
-            kind = shape.shape_type()
-            transformed = len(rods) + len(squares) < MOST_TRANSFORMS
-            if kind in CURVES:
-                self._mark_rods(*_segments(shape, kind))
-            elif kind == SPHERE:
-                radius = 0.5 * float(box.extents().x)
-                rods.append((*box.min, *box.max, *box.center(), *box.center(), radius, radius))
-            elif kind == CYLINDER and transformed:
-                x, _, z, o = _columns(shape)
-                end, radius = [a + b for a, b in zip(o, z)], math.hypot(*x)
-                rods.append((*box.min, *box.max, *o, *end, radius, radius))
-            elif kind in SQUARES and transformed and min(box.extents()) > 0:
-                x, y, _, o = _columns(shape)
-                squares.append((*x, *y, *o))
-            else:  # boxes of rectangles along the axes are flat
-                rods.append((*box.min, *box.max, *box.min, *box.min, -dr.inf, dr.inf))
-        if squares:
-            n = [opaque(mi.Float(column)) for column in zip(*squares)]
-            x, y, o = mi.Vector3f(n[:3]), mi.Vector3f(n[3:6]), mi.Point3f(n[6:])
-            self._mark_triangles(o - x - y, o + x - y, o + x + y)
-            self._mark_triangles(o - x - y, o + x + y, o - x + y)
-        if rods:
-            n = [opaque(mi.Float(column)) for column in zip(*rods)]
-            points = [mi.Point3f(n[i : i + 3]) for i in (0, 3, 6, 9)]
-            self._mark_rods(*points, *n[12:])
 
     @dr.syntax
     def _mark_triangles(self, a: mi.Point3f, b: mi.Point3f, c: mi.Point3f):
@@ -461,6 +429,47 @@ def _levels(box, focus, size, coarsest):
     return edge, levels
 
 
+class _Pieces:
+    """What surfaces consist of, in scene units: triangles by their corners, and what
+    `_Grid._mark_rods` takes."""
+
+    def __init__(self, shapes):
+        meshes = [shape for shape in shapes.shapes if shape.is_mesh()]
+        meshes = sorted(meshes, key=lambda mesh: -mesh.face_count())[:MOST_MESHES]
+        self.triangles = [_triangles(mesh) for mesh in meshes]
+        self.rods = []
+        rods: list[tuple[float, ...]] = []
+        squares: list[tuple[float, ...]] = []
+        for shape, extent in zip(shapes.shapes, shapes.extents):
+            box = extent.box
+            if shape in meshes or not box.valid():
+                continue
+            kind = shape.shape_type()
+            transformed = len(rods) + len(squares) < MOST_TRANSFORMS
+            if kind in CURVES:
+                self.rods.append(_segments(shape, kind))
+            elif kind == SPHERE:
+                radius = 0.5 * float(box.extents().x)
+                rods.append((*box.min, *box.max, *box.center(), *box.center(), radius, radius))
+            elif kind == CYLINDER and transformed:
+                x, _, z, o = _columns(shape)
+                end, radius = [a + b for a, b in zip(o, z)], math.hypot(*x)
+                rods.append((*box.min, *box.max, *o, *end, radius, radius))
+            elif kind in SQUARES and transformed and min(box.extents()) > 0:
+                x, y, _, o = _columns(shape)
+                squares.append((*x, *y, *o))
+            else:  # boxes of rectangles along the axes are flat
+                rods.append((*box.min, *box.max, *box.min, *box.min, -dr.inf, dr.inf))
+        if squares:
+            n = [opaque(mi.Float(column)) for column in zip(*squares)]
+            x, y, o = mi.Vector3f(n[:3]), mi.Vector3f(n[3:6]), mi.Point3f(n[6:])
+            self.triangles.append([o - x - y, o + x - y, o + x + y])
+            self.triangles.append([o - x - y, o + x + y, o - x + y])
+        if rods:
+            n = [opaque(mi.Float(column)) for column in zip(*rods)]
+            self.rods.append((*(mi.Point3f(n[i : i + 3]) for i in (0, 3, 6, 9)), *n[12:]))
+
+
 def _columns(shape):
     """The columns of a shape's transform, in Python floats."""
     matrix = mi.traverse(shape)["to_world"].matrix
@@ -478,7 +487,7 @@ def _triangles(mesh):
 
 
 def _segments(curve, kind):
-    """Boxes, axes and radii (scene units) of a curve's segments, for `Clearance._mark_rods`."""
+    """Boxes, axes and radii (scene units) of a curve's segments, for `_Grid._mark_rods`."""
     parameters = mi.traverse(curve)
     points, segments = parameters["control_points"], parameters["segment_indices"]
     count = 4 if kind == BSPLINE else 2
