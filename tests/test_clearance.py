@@ -5,6 +5,7 @@ import mitsuba as mi
 import pytest
 from drjit.llvm import Array3f64, Float64
 
+from benchmarks import truth
 from nil_mitsuba import geometry
 
 POINTS, SAMPLES = 4_000, 20_000
@@ -118,6 +119,143 @@ def test_no_surface_lies_closer_than_a_plain_scene_says(rgb):
     )
     assert not dr.any(Float64(says) > least + ROUNDING)[0]
     assert dr.mean(says)[0] > 0.5
+
+
+def others(folder):
+    """Curves and an instance, in and across the cube."""
+    for name, radius in ("thin.txt", 0.01), ("thick.txt", 0.04):
+        points = [(0.1, 0.2, 0.3), (0.5, 0.1, 0.6), (0.6, 0.8, 0.3), (1.1, 0.7, 0.8), (0.9, 0, 0)]
+        lines = [f"{x} {y} {z} {radius * (1 + 0.1 * i)}" for i, (x, y, z) in enumerate(points)]
+        (folder / name).write_text("\n".join(lines))
+    return {
+        "type": "scene",
+        "spline": {"type": "bsplinecurve", "filename": str(folder / "thick.txt")},
+        "line": {"type": "linearcurve", "filename": str(folder / "thin.txt")},
+        "group": {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.1}},
+        "instance": {
+            "type": "instance",
+            "to_world": transform().translate([0.2, 0.7, 0.7]).scale([1, 1.5, 0.6]),
+            "group": {"type": "ref", "id": "group"},
+        },
+    }
+
+
+@pytest.mark.parametrize("quotient", [True, False])
+def test_curves_and_instances_keep_their_distance(rgb, tmp_path, quotient):
+    scene = mi.load_dict(others(tmp_path))
+    clearance = clearance_of(scene, 2.0, quotient)
+    p = points_in((0, 0, 0), (1, 1, 1), 1)
+    says, least = (
+        clearance.at(p),
+        distances(p, points_on(scene, (0, 0, 0), (1, 1, 1)), clearance.space),
+    )
+    assert not dr.any(Float64(says) > least + ROUNDING)[0]
+    assert dr.mean(says)[0] > 0.03
+
+
+@pytest.mark.parametrize("origin, size", [((0, 0, 0), 1), ((-30, 20, 7), 0.5)])
+def test_grids_around_a_camera_promise_more_and_no_surface(rgb, origin, size):
+    """Up to far from the camera, wherever the cube lies in the scene."""
+    scene = mi.load_dict(ground())
+    focus = (0.2, -1.4, 0.9)
+    coarse = clearance_of(scene, 1.0, False, origin, size)
+    fine = clearance_of(scene, 1.0, False, origin, size, mi.ScalarPoint3f(*focus))
+    assert fine.levels > 0
+    surfaces = points_on(scene, (-4, -4, -0.1), (4, 4, 2))
+    for half in (0.3, 1, 3, 9):
+        low, high = ([c + sign * half for c in focus] for sign in (-1, 1))
+        p = fine.space.to_cells(points_in(low, high, 3))
+        says, least = fine.at(p), distances(p, surfaces, fine.space)
+        assert not dr.any(Float64(says) > least + 2e-5)[0]
+        assert dr.mean(says)[0] > (1.02 if half < 1 else 0.97) * dr.mean(coarse.at(p))[0]
+
+
+@pytest.mark.parametrize("quotient", [True, False])
+def test_little_of_empty_space_is_lost(rgb, quotient):
+    """No more than three diagonals of a voxel of what there is up to the furthest."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ball": {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.1},
+            "corner": {"type": "sphere", "center": [0.05, 0.05, 0.05], "radius": 0.05},
+            "opposite": {"type": "sphere", "center": [0.95, 0.95, 0.95], "radius": 0.05},
+        }
+    )
+    clearance = clearance_of(scene, 0.0, quotient)
+    p = points_in((0, 0, 0), (1, 1, 1), 1)
+    least = distances(p, points_on(scene, (0, 0, 0), (1, 1, 1)), clearance.space)
+    lost = dr.minimum(least, clearance.grid.furthest) - Float64(clearance.at(p))
+    assert dr.max(lost)[0] < 3 * dr.norm(clearance.grid.edges)[0]
+
+
+def test_a_leap_ends_before_the_first_hit(rgb):
+    """By the truth's float64 geodesics through the copies of two balls and a sheet."""
+    surfaces = [
+        truth.Sphere((0.3, 0.4, 0.9), 0.2),
+        truth.Sphere((0.8, 0.7, 0.3), 0.12),
+        truth.Rectangle((0.1, 0.8, 0.4), (0.3, 0.1, 0), (0, 0.1, 0.3)),
+    ]
+    scene = {"type": "scene"} | {str(i): s.to_mitsuba(mi) for i, s in enumerate(surfaces)}
+    for twist in (1, -3):
+        clearance = clearance_of(mi.load_dict(scene), float(twist))
+        rng = mi.PCG32(POINTS, 11)
+        v = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        p = points_in((0, 0, 0), (1, 1, 1), 12)
+        leap = Float64(clearance.leap(p, v))
+        hit = truth.first_hit(surfaces, p, dr.normalize(Array3f64(v)), 0.6, twist, True)
+        assert not dr.any(leap > hit.t)[0]
+        assert dr.mean(leap)[0] > 0.05
+
+
+def test_clearances_follow_what_moves(rgb):
+    scene = mi.load_dict(ground())
+    here = mi.Point3f(0.2, 2.4, 0.5)
+    assert clearance_of(scene, quotient=False).at(here)[0] > 0.3  # in a ball's centre
+    parameters = mi.traverse(scene)
+    parameters["ball0.to_world"] = mi.Transform4f().translate([0.4, 2.4, 0.5]).scale(0.2)
+    parameters.update()
+    assert clearance_of(scene, quotient=False).at(here)[0] == 0
+
+
+def test_a_ball_on_a_ground_of_thousands_of_cells_is_seen_from_nearby(rgb):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ground": {"type": "rectangle", "to_world": transform().scale(1000)},
+            "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
+        }
+    )
+    clearance = clearance_of(scene, quotient=False, focus=mi.ScalarPoint3f(0.4, -1.5, 0.8))
+    assert clearance.useful
+    p = points_in((-2, -2, 0), (2, 2, 1.5), 2)
+    true = dr.minimum(dr.abs(p.z), dr.abs(dr.norm(p - mi.Point3f(0, 0, 0.5)) - 0.5))
+    says = clearance.at(p)
+    # The slack for coordinates of a thousand
+    assert not dr.any(says > true + 1e-6)[0]
+    assert dr.mean(says)[0] > 0.6 * dr.mean(true)[0]
+
+
+@pytest.mark.parametrize(
+    "shapes, useful",
+    [
+        ({}, False),
+        ({"ground": {"type": "rectangle"}}, False),
+        ({"ground": {"type": "rectangle", "to_world": "huge"}}, False),
+        ({"ball": {"type": "sphere", "center": [0, 0, 1e5], "radius": 1e-3}}, False),
+        ({"ball": {"type": "sphere", "center": [0, 0, float("nan")]}}, False),
+        ({"ball": {"type": "sphere", "radius": 1e30}}, False),
+    ],
+)
+def test_odd_scenes_have_clearances_too(rgb, shapes, useful):
+    for shape in shapes.values():
+        if "to_world" in shape:
+            shape["to_world"] = transform().scale(1e12)
+    scene = mi.load_dict({"type": "scene"} | shapes)
+    for focus in (None, mi.ScalarPoint3f(0.1, 0.2, 0.3)):
+        clearance = clearance_of(scene, quotient=False, focus=focus)
+        assert clearance.useful == useful
+        says = clearance.at(mi.Point3f([0.1, 3, 1e6], [0.2, 1, 1], [0.5, -7, 1]))
+        assert dr.all(says >= 0)[0]
 
 
 @pytest.mark.parametrize("twist", TWISTS)
