@@ -51,13 +51,13 @@ def ground():
     return scene
 
 
-def clearance_of(scene, twist=1.0, quotient=True, origin=(0, 0, 0), size=1.0, focus=None):
+def clearance_of(scene, twist=1.0, quotient=True, origin=(0, 0, 0), size=1.0, **grids):
     from nil_mitsuba.clearance import Clearance
     from nil_mitsuba.quotient import Space
     from nil_mitsuba.shapes import Shapes
 
     space = Space(twist, quotient, list(origin), size)
-    return Clearance(space, Shapes(scene), focus)
+    return Clearance(space, Shapes(scene), **grids)
 
 
 def points_in(low, high, seed, count=POINTS):
@@ -66,9 +66,9 @@ def points_in(low, high, seed, count=POINTS):
     return mi.Point3f(low) + u * (mi.Vector3f(high) - mi.Vector3f(low))
 
 
-def points_on(scene, low, high, seed=5):
+def points_on(scene, low, high, seed=5, count=SAMPLES):
     """Points (scene units) on the surfaces of a scene: where rays through a box meet them."""
-    o, q = points_in(low, high, seed, SAMPLES), points_in(low, high, seed + 1, SAMPLES)
+    o, q = (points_in(low, high, seed + i, count) for i in (0, 1))
     ray = mi.Ray3f(o, dr.normalize(q - o))
     si = scene.ray_intersect(ray)
     return mi.Point3f(dr.gather(mi.Point3f, si.p, dr.compress(si.is_valid())))
@@ -140,6 +140,36 @@ def others(folder):
     }
 
 
+@pytest.mark.parametrize("twist", [1.0, 0.0, -6.0])
+@pytest.mark.parametrize("quotient", [True, False])
+def test_each_voxel_that_a_surface_touches_is_marked(rgb, monkeypatch, tmp_path, quotient, twist):
+    """Its copies' voxels beside the cube, too: neighbours would hide that one is missing."""
+    from nil_mitsuba import clearance as module
+
+    marked = []
+    along_axis = module._along_axis
+    monkeypatch.setattr(module, "_along_axis", lambda *a: marked.append(a[0]) or along_axis(*a))
+    for description in (lattice(), others(tmp_path)):
+        scene = mi.load_dict(description)
+        marked.clear()
+        # Coarse voxels, of which a surface may touch a corner only
+        clearance = clearance_of(scene, twist, quotient, voxels=12)
+        q = points_on(scene, (0, 0, 0), (1, 1, 1), count=200_000)
+        if not quotient:
+            assert not dr.any(dr.gather(mi.Float, marked[0], clearance.grid.index(q)) > 0)[0]
+            continue
+        q = dr.gather(mi.Point3f, q, dr.compress(dr.all((q >= 0) & (q < 1))))
+        for g in (-1, 0, 1):
+            x, z = q.x + g, q.z + twist * g * q.y
+            z -= dr.floor(z)
+            # Three voxels on either side, and no points that rounding may put in another one
+            voxel = mi.Point3f(12 * x + 3, 12 * q.y, 12 * z)
+            sure = dr.all(dr.abs(voxel - dr.round(voxel)) > 1e-4) & (voxel.x > 0) & (voxel.x < 18)
+            i = mi.Vector3u(voxel)
+            found = dr.gather(mi.Float, marked[0], (i.z * 12 + i.y) * 18 + i.x, sure)
+            assert not dr.any(sure & (found > 0))[0]
+
+
 @pytest.mark.parametrize("quotient", [True, False])
 def test_curves_and_instances_keep_their_distance(rgb, tmp_path, quotient):
     scene = mi.load_dict(others(tmp_path))
@@ -159,7 +189,7 @@ def test_grids_around_a_camera_promise_more_and_no_surface(rgb, origin, size):
     scene = mi.load_dict(ground())
     focus = (0.2, -1.4, 0.9)
     coarse = clearance_of(scene, 1.0, False, origin, size)
-    fine = clearance_of(scene, 1.0, False, origin, size, mi.ScalarPoint3f(*focus))
+    fine = clearance_of(scene, 1.0, False, origin, size, focus=mi.ScalarPoint3f(*focus))
     assert fine.levels > 0
     surfaces = points_on(scene, (-4, -4, -0.1), (4, 4, 2))
     for half in (0.3, 1, 3, 9):
