@@ -59,8 +59,7 @@ class Clearance:
         self.space = space
         size = space.size_number
         box = shapes.box if shapes.box.valid() else mi.ScalarBoundingBox3f([0, 0, 0], [0, 0, 0])
-        largest = max(abs(float(c)) for c in (*box.min, *box.max))
-        self.slack = space.slack + opaque(mi.Float(ROUNDING * largest / size))
+        self.slack = space.slack + opaque(mi.Float(ROUNDING * _largest(shapes, space) / size))
         self.levels = 0
         pieces = _Pieces(shapes)
         if space.quotient:
@@ -414,6 +413,16 @@ def _counts(extents, total):
         for i in free:
             counts[i] = max(1, int(extents[i] / edge))
     return tuple(counts)
+
+
+def _largest(shapes, space):
+    """The largest coordinate (scene units) of shapes, in the quotient of those in the cube."""
+    low = mi.ScalarPoint3f([c[0] for c in space.origin])
+    cube = mi.ScalarBoundingBox3f(low, low + space.size_number)
+    boxes = [extent.box for extent in shapes.extents if extent.box.valid()]
+    if space.quotient:
+        boxes = [box for box in boxes if box.overlaps(cube)]
+    return max((abs(c) for box in boxes for c in (*box.min, *box.max)), default=0.0)
 
 
 def _levels(box, focus, size, coarsest):

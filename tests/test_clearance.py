@@ -237,6 +237,25 @@ def test_a_leap_ends_before_the_first_hit(rgb):
         assert dr.mean(leap)[0] > 0.05
 
 
+def test_what_lies_far_outside_of_the_cube_takes_nothing(rgb):
+    """It does not exist in the quotient, and its coordinates round nothing."""
+    far = {"type": "sphere", "center": [1e6, 0, 0], "radius": 2.0}
+    near, both = (mi.load_dict(lattice() | more) for more in ({}, {"far": far}))
+    p = points_in((0, 0, 0), (1, 1, 1), 1)
+    assert dr.all(clearance_of(near).at(p) == clearance_of(both).at(p))[0]
+
+
+def test_grids_of_other_scenes_compile_nothing_anew(rgb):
+    clearance_of(mi.load_dict(lattice())), clearance_of(mi.load_dict(ground()), quotient=False)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for origin, size in ((0.1, 0.2, 0.3), 0.9), ((-1, 0, 0), 3.0):
+            clearance_of(mi.load_dict(lattice()), 3.0, True, origin, size)
+            clearance_of(mi.load_dict(ground()), -2.0, False, origin, size)
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert kernels and all(kernel["cache_hit"] for kernel in kernels)
+
+
 def test_clearances_follow_what_moves(rgb):
     scene = mi.load_dict(ground())
     here = mi.Point3f(0.2, 2.4, 0.5)
