@@ -87,9 +87,9 @@ class NilIntegrator(ADIntegrator):
             dr.eval(image)
         return image
 
-    def view(self, scene: mi.Scene) -> View:
-        """The scene as this integrator's parameters show it."""
-        view = View(scene, self)
+    def view(self, scene: mi.Scene, general: bool = False) -> View:
+        """The scene as this integrator's parameters show it; ``general`` as of `Space`."""
+        view = View(scene, self, general)
         _warn_of_what_is_ignored(scene, view.shapes, self)
         return view
 
@@ -356,7 +356,7 @@ def _warn_of_what_is_ignored(scene, shapes, integrator):
 class View:
     """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
 
-    def __init__(self, scene: mi.Scene, integrator: NilIntegrator):
+    def __init__(self, scene: mi.Scene, integrator: NilIntegrator, general: bool = False):
         if dr.flag(dr.JitFlag.FreezingScope):
             raise RuntimeError(
                 'the integrator "nil" takes numbers from the scene that a frozen function would '
@@ -368,6 +368,7 @@ class View:
             integrator.quotient,
             list(integrator.cell_origin),
             integrator.cell_size,
+            general,
         )
         self.shapes = Shapes(scene)
         self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes)

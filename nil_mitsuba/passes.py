@@ -50,6 +50,7 @@ class Passes:
     A pass holds as many samples as fit into `WAVEFRONT_SAMPLES`, or ``pass_spp`` per pixel if that
     is less, but at least one per pixel. It is rendered in wavefronts; with the sampler
     "independent" each sample has a seed of its own, so that it does not matter where they are cut.
+    ``general``: at the twist 0, too, the kernels of other twists, for who changes it while looking.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Passes:
         seed: int = 0,
         spp: int = 0,
         pass_spp: int | None = None,
+        general: bool = False,
     ):
         self.integrator = integrator
         self.scene = scene
@@ -93,7 +95,7 @@ class Passes:
             self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
             self.wavefront = math.ceil(pixels / self.tiles) * self.spp
 
-        self.view = integrator.view(scene)
+        self.view = integrator.view(scene, general)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
         self.film.prepare(channel_names(self.layers, "mean"))
 

@@ -22,15 +22,23 @@ class Space:
 
     ``origin`` (scene units) is the group's identity and the cube's lower corner, ``size`` (scene
     units) the length of its edge. Numbers that vary between renders are opaque, so that kernels
-    are compiled once for all of them.
+    are compiled once for all of them. Only the twist 0 is written into them, and what it makes 0
+    falls away: such a space is ``flat``. If it is ``general``, kernels do for the twist 0, too.
     """
 
-    def __init__(self, twist: float, quotient: bool, origin: list[float], size: float):
+    def __init__(
+        self,
+        twist: float,
+        quotient: bool,
+        origin: list[float],
+        size: float,
+        general: bool = False,
+    ):
         self.quotient = quotient
-        self.flat = twist == 0
+        self.flat = twist == 0 and not general
         self.twist_number = twist
-        self.twist = dr.opaque(mi.Float, twist)
-        self.integer_twist = dr.opaque(mi.Int32, round(twist))
+        self._twist = 0 if self.flat else dr.opaque(mi.Float, twist)
+        self._integer_twist = 0 if self.flat else dr.opaque(mi.Int32, round(twist))
         self.origin = opaque(mi.Point3f(*origin))
         self.size_number = size
         self.size = dr.opaque(mi.Float, size)
@@ -39,6 +47,16 @@ class Space:
         # what Mitsuba's float32 arithmetic may lose at the joint of two chords.
         extent = 1 + max(abs(c) for c in origin) / size
         self.slack = dr.opaque(mi.Float, 16 * 2**-24 * extent)
+
+    # Dr.Jit makes a 0 as wide as what it is multiplied by, in its place: it must not be kept
+
+    @property
+    def twist(self) -> mi.Float:
+        return mi.Float(self._twist)
+
+    @property
+    def integer_twist(self) -> mi.Int32:
+        return mi.Int32(self._integer_twist)
 
     def to_cells(self, p: mi.Point3f) -> mi.Point3f:
         """Scene coordinates to cell coordinates."""

@@ -413,3 +413,28 @@ def test_moment_sees_the_image_that_nil_renders(rgb):
     difference, variance = Y - through.mean[1], 2 * through.variance[1]
     assert dr.max(dr.abs(difference) * dr.rsqrt(variance))[0] < sidak(16 * 16)
     assert abs(dr.sum(difference)[0]) < POOLED_Z * dr.sum(variance)[0] ** 0.5
+
+
+def test_twist_0_in_the_kernels_of_all_twists_shows_the_same_picture(rgb):
+    from nil_mitsuba.passes import Passes
+
+    scene = cornell_box(32)
+
+    def seen(twist, general):
+        nil = mi.load_dict(FLAT | {"twist": twist, "max_depth": 4})
+        passes = Passes(nil, scene, seed=3, spp=128, general=general)
+        dr.kernel_history_clear()
+        image = passes.develop(passes.nothing().plus(passes.render(0)))
+        dr.eval(image)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+        return image, max(kernels, key=lambda kernel: kernel["operation_count"])["hash"]
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        bent, others = seen(0.5, False)
+        general, shared = seen(0.0, True)
+        special, own = seen(0.0, False)
+    assert shared == others != own
+    # Rounding sends a few paths elsewhere
+    off = dr.abs(general - special) > 0.01 * special + 1e-4
+    assert dr.mean(mi.Float(off.array)) < 0.01
+    assert dr.mean(mi.Float((dr.abs(bent - special) > 0.01 * special + 1e-4).array)) > 0.5
