@@ -235,13 +235,13 @@ def connect(p, q, twist=1):
     ``2v + R² (v − sin v cos v)/sin² v = ζ`` for the half turn ``|v| ≤ π``, where
     ``p⁻¹·q = (x, y, z)``, ``R = k √(x² + y²)/2`` and ``ζ = k (z − k x y/2)``. On a fibre beyond
     ``|ζ| = 2π`` a whole circle of geodesics is shortest: the one that starts in the half plane of
-    E1 and E3 is returned. Equal points have distance 0 and the direction E3.
+    E1 and E3 is returned. Points whose distance is 0 when squared (below 1e-19 in float32) are
+    equal: they have distance 0 and the direction E3.
     """
     dx, dy, dz = q.x - p.x, q.y - p.y, q.z - p.z
     twist = type(dx)(twist)
     k = dr.abs(twist)
-    r = _length(dx, dy)
-    R = 0.5 * k * r
+    R2 = dr.square(0.5 * k) * dr.fma(dx, dx, dy * dy)
 
     # Height z − k x y/2 of p⁻¹·q, and ζ to twice the precision: a fibre needs ζ − 2π
     shear = twist * (p.x + q.x)
@@ -256,53 +256,55 @@ def connect(p, q, twist=1):
 
     zeta, zeta_lost = zeta * orientation, zeta_lost * orientation
 
-    # Half turns up to π/2, where the equation itself gives w T without dividing by k
-    zeta_quarter = dr.fma(pi / 2, dr.square(R), pi)
-    s, c, sinc, g, lift = _on_quarter(_near_half_turn(R, zeta, zeta_quarter))
-    inv_sinc = dr.rcp(sinc)
-    horizontal = r * inv_sinc
-    vertical = height / dr.fma(0.5 * dr.square(R * inv_sinc), lift, 1)
-    near = (s, c, sinc, g, horizontal, vertical)
+    # Half turns up to π/2, where the equation itself gives w T without dividing by k. An arc's
+    # horizontal part X, Y is as long as the arc without its bend, and points along its chord.
+    zeta_quarter = dr.fma(pi / 2, R2, pi)
+    s, c, sinc, g, lift = _near_half_turn(R2, zeta)
+    sinc2 = dr.square(sinc)
+    denominator = dr.fma(0.5 * R2, lift, sinc2)
+    inverse = dr.rcp(denominator * sinc)  # one division for both
+    inv_sinc = denominator * inverse
+    near = (s, c, sinc, g, dx * inv_sinc, dy * inv_sinc, height * sinc2 * sinc * inverse)
 
-    def far(R, zeta, zeta_lost, height, k, near):
+    def far(dx, dy, zeta, zeta_lost, height, k, near):
         # What a fibre makes of 0/0 is the limit of the circle radius R / sin v
+        r = _length(dx, dy)
+        R = dr.maximum(0.5 * k * r, _ON_FIBRE[_is_double(dx)])
         x = _far_half_turn(R, zeta, zeta_lost)
         s, c, _, _, _ = _on_quarter(x)
         v, c = pi - x, -c
-        radius = dr.maximum(R, _ON_FIBRE[_is_double(R)]) / s
+        horizontal = 2 * R * v / (s * k)
+        # The chord leaves a fibre in no direction; −E1 makes the geodesic start towards E1
+        scale = horizontal / dr.select(r > 0, r, 1.0)
         return (
             s,
             c,
             s / v,
             (s - v * c) / (v * dr.square(v)),
-            2 * radius * v / k,
+            dr.select(r > 0, dx * scale, -horizontal),
+            dy * scale,
             dr.copysign(2 * v / k, height),
         )
 
     # A branch: it costs as much as the rest, and few points lie beyond
-    s, c, sinc, g, horizontal, vertical = dr.if_stmt(
-        (R, zeta, zeta_lost, height, k, near),
+    s, c, sinc, g, X, Y, vertical = dr.if_stmt(
+        (dx, dy, zeta, zeta_lost, height, k, near),
         zeta > zeta_quarter,
         far,
-        lambda R, zeta, zeta_lost, height, k, near: near,
+        lambda dx, dy, zeta, zeta_lost, height, k, near: near,
     )
 
-    distance = _length(horizontal, vertical)
-    inv_distance = dr.rcp(dr.select(distance > 0, distance, 1.0))
-    a = horizontal * inv_distance
-    w = dr.select(distance > 0, vertical * inv_distance, 1)
-    # The chord leaves a fibre in no direction; −E1 makes the geodesic start towards E1
-    inv_r = dr.rcp(dr.select(r > 0, r, 1.0))
-    chord_x, chord_y = dr.select(r > 0, dx * inv_r, -1), dy * inv_r
+    horizontal2 = dr.fma(X, X, dr.square(Y))
+    distance2 = dr.fma(vertical, vertical, horizontal2)
+    apart = distance2 > 0
+    inv_distance = dr.rsqrt(dr.select(apart, distance2, 1.0))
+    distance = distance2 * inv_distance
+    w = dr.select(apart, vertical * inv_distance, 1)
     # In azimuth v before the chord at the start, v past it on arrival
-    along, across = a * c, a * s * orientation
-    direction = type(p)(
-        dr.fma(chord_x, along, chord_y * across), dr.fma(chord_y, along, -chord_x * across), w
-    )
-    arrival = type(p)(
-        dr.fma(chord_x, along, -chord_y * across), dr.fma(chord_y, along, chord_x * across), w
-    )
-    density = _area_density(distance, sinc, g, dr.square(0.5 * k * horizontal))
+    along, across = c * inv_distance, s * orientation * inv_distance
+    direction = type(p)(dr.fma(X, along, Y * across), dr.fma(Y, along, -X * across), w)
+    arrival = type(p)(dr.fma(X, along, -Y * across), dr.fma(Y, along, X * across), w)
+    density = _area_density(distance, sinc, g, dr.square(0.5 * k) * horizontal2)
     return Connection(direction, arrival, distance, density)
 
 
@@ -310,9 +312,20 @@ def connect(p, q, twist=1):
 # to be seen beside one rounding of a direction, while its square stays clear of underflow
 _ON_FIBRE = {False: 1e-15, True: 1e-60}
 
-# The first guess is off by at most 2.5 %, which two steps make 7e-8 and three 1e-15 (measured on
+# Beyond π/2 the first guess is off by at most 2.5 %, which two steps of Newton's make 7e-8 and
+# three 1e-15; below, by 2.4e-4, which one step makes 7e-8 and two 1e-14 (measured on
 # 0 ≤ R ≤ 150, 0 ≤ ζ ≤ 1000, relative in v or in π − v)
-_NEWTON_STEPS = {False: 2, True: 3}
+_NEAR_STEPS, _FAR_STEPS = {False: 1, True: 3}, {False: 2, True: 3}
+
+# μ(v)/v of the root of 2v + R² μ(v) = ζ, by powers of (ζ / ζ(π/2))², each of them a polynomial in
+# 1/(1 + R²/2): fitted to 3e-4, weighted by what it changes in v
+_MU = (
+    (2 / 3,),
+    (0.4894, -0.4537, 0.2059),
+    (-0.2851, 1.1584, -0.9561),
+    (0.1901, -1.1126, 1.2395),
+    (-0.0613, 0.4088, -0.4902),
+)
 
 # 2π in two parts, the second what the first lacks
 _TWO_PI = {
@@ -321,19 +334,30 @@ _TWO_PI = {
 }
 
 
-def _near_half_turn(R, zeta, zeta_quarter):
-    """Root v ≤ π/2 of ``2v + R² μ(v) = ζ``, 0 ≤ ζ ≤ ``zeta_quarter``, its value at π/2.
+def _near_half_turn(R2, zeta):
+    """The root v ≤ π/2 of ``2v + R² μ(v) = ζ``, as `_on_quarter` describes it.
 
-    ``μ(v) = (v − sin v cos v)/sin² v``.
+    ``μ(v) = (v − sin v cos v)/sin² v``; 0 ≤ ζ ≤ π + π R²/2, its value at π/2.
     """
-    R2 = dr.square(R)
-    # μ(v)/v runs from 2/3 to 1 at π/2: its limit for large R, fitted in (ζ / ζ(π/2))²
-    quarter = dr.minimum(dr.square(zeta / zeta_quarter), 1)
-    x = zeta / dr.fma(R2, dr.fma(quarter, dr.fma(quarter, -0.16, 0.493), 2 / 3), 2)
-    for _ in range(_NEWTON_STEPS[_is_double(R)]):
-        _, _, mu, slope = _mu(x)
-        x = x - (dr.fma(R2, mu, 2 * x) - zeta) / dr.fma(R2, slope, 2)
-    return x
+    double = _is_double(R2)
+    straight = dr.rcp(dr.fma(0.5, R2, 1))
+    quarter = dr.minimum(dr.square(zeta * straight / pi), 1)
+    powers = [_polynomial(straight, coefficients) for coefficients in _MU]
+    x = zeta / dr.fma(R2, _polynomial(quarter, powers), 2)
+    for step in reversed(range(_NEAR_STEPS[double])):
+        s, c, sinc, g, lift = _on_quarter(x)
+        # Newton's step, both of its parts times sinc³
+        cube = dr.square(sinc) * sinc
+        residual = dr.fma(dr.fma(-2, x, zeta), cube, -R2 * x * lift * sinc)
+        change = 0.5 * residual / dr.fma(R2, g, cube)
+        if step:
+            x = x + change
+    # The last one is so small that it changes all by their slopes: g' = −v/15 + v³/210 − …
+    y = dr.square(x)
+    slope_g = x * dr.fma(y, dr.fma(y, -1 / 7560, 1 / 210), -1 / 15)
+    s, c = dr.fma(change, c, s), dr.fma(-change, s, c)
+    sinc, g = dr.fma(-change * x, g, sinc), dr.fma(change, slope_g, g)
+    return s, c, sinc, g, _lift(sinc, c, g)
 
 
 def _far_half_turn(R, zeta, zeta_lost):
@@ -358,7 +382,7 @@ def _far_half_turn(R, zeta, zeta_lost):
     root_neg = h_neg + dr.rcp(dr.fma(h_neg, dr.fma(0.5, h_neg, 2 / 3), 1))
     x = dr.minimum(unit * dr.select(h > 0, root_pos, root_neg), pi / 2)
 
-    for _ in range(_NEWTON_STEPS[double]):
+    for _ in range(_FAR_STEPS[double]):
         s, c, mu, slope = _mu(x)
         inv_s = dr.rcp(s)
         pole = pi * R2 * dr.square(inv_s)

@@ -518,7 +518,7 @@ def test_deck_elements_multiply_as_integers_and_act_on_points():
 
 
 def test_nothing_overflows_or_is_lost_for_points_far_out():
-    far = dr.llvm.Array3f([1e4, 0, 1e-30, 3e3], [0, 1e-3, 1e-30, -3e3], [1e4, -1e4, 1e-30, 9e6])
+    far = dr.llvm.Array3f([1e4, 0, 1e-15, 3e3], [0, 1e-3, 1e-15, -3e3], [1e4, -1e4, 1e-15, 9e6])
     for k in (-3, 0, 1):
         c = geometry.connect(dr.llvm.Array3f(0), far, k)
         end, _ = geometry.flow(dr.llvm.Array3f(0), c.direction, c.distance, k)
