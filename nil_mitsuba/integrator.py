@@ -179,7 +179,8 @@ class NilIntegrator(ADIntegrator):
         if self.hide_emitters:
             p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, far, active)
 
-        while active:
+        # What the loop leaves as it is need not be part of its state
+        while dr.hint(active, exclude=[ray, far, spent]):
             # --------------------- The next vertex ---------------------
 
             start, home = mi.Point3f(p), mi.Vector3i(0)
