@@ -73,14 +73,14 @@ class Camera:
 
         # Mitsuba's clip planes are across the axis, and both bound the way along the geodesic.
         on_plane = mi.Vector3f((ray.o - near * ray.d) - origin)
-        near /= space.size
-        far = ray.maxt / space.size
+        near *= space.cells_per_unit
+        far = ray.maxt * space.cells_per_unit
         if ray.has_differentials:
             # The narrower side of a pixel bounds the error.
             spread = self.tolerance * dr.minimum(dr.norm(ray.d_x - ray.d), dr.norm(ray.d_y - ray.d))
             width = (
                 self.tolerance
-                / space.size
+                * space.cells_per_unit
                 * dr.minimum(dr.norm(ray.o_x - ray.o), dr.norm(ray.o_y - ray.o))
             )
             cone = Cone(dr.fma(spread, near, width), spread)
@@ -91,7 +91,7 @@ class Camera:
         if self.thinlens:
             p, v = self._through_lens(p, on_plane, ray)
         else:
-            p = geometry.multiply(p, mi.Point3f(on_plane / space.size), space.twist)
+            p = geometry.multiply(p, mi.Point3f(on_plane * space.cells_per_unit), space.twist)
         p, v = geometry.flow(p, v, near, space.twist)
         return p, v, cone, far
 
@@ -109,8 +109,8 @@ class Camera:
         space, k = self.space, self.space.twist
         to_focus = on_lens + self.focus_distance / self.views[0].depth(ray) * ray.d
         length = dr.norm(to_focus)
-        focus, _ = geometry.flow(pinhole, mi.Vector3f(to_focus / length), length / space.size, k)
-        lens = geometry.multiply(pinhole, mi.Point3f(on_lens / space.size), k)
+        focus, _ = geometry.flow(pinhole, mi.Vector3f(to_focus / length), length * space.cells_per_unit, k)
+        lens = geometry.multiply(pinhole, mi.Point3f(on_lens * space.cells_per_unit), k)
         return lens, mi.Vector3f(geometry.connect(lens, focus, k).direction)
 
 

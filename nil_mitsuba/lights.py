@@ -395,7 +395,7 @@ class Lights:
         reached = active & (cosine > 0) & (density > 0) & (way.distance <= self.max_distance)
         pdf = dr.select(reached, pdf, 0)
         # The light's own surface, met at a grazing angle, must not hide it
-        margin = dr.gather(mi.Float, self.area_margins, index, active) / space.size
+        margin = dr.gather(mi.Float, self.area_margins, index, active) * space.cells_per_unit
         margin = dr.fma(ARRIVAL_ROUNDING, way.distance, margin)
         reach = way.distance - margin / dr.maximum(cosine, GRAZING)
         return LightSample(
