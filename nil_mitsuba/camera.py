@@ -109,7 +109,9 @@ class Camera:
         space, k = self.space, self.space.twist
         to_focus = on_lens + self.focus_distance / self.views[0].depth(ray) * ray.d
         length = dr.norm(to_focus)
-        focus, _ = geometry.flow(pinhole, mi.Vector3f(to_focus / length), length * space.cells_per_unit, k)
+        focus, _ = geometry.flow(
+            pinhole, mi.Vector3f(to_focus / length), length * space.cells_per_unit, k
+        )
         lens = geometry.multiply(pinhole, mi.Point3f(on_lens * space.cells_per_unit), k)
         return lens, mi.Vector3f(geometry.connect(lens, focus, k).direction)
 

@@ -1,8 +1,9 @@
-"""Where a scene sits in Nil, and how a straight chord passes through the glued faces of its cube.
+"""Where a scene sits in Nil, and how a straight chord passes through the glued faces of its cell.
 
-The quotient Nil/Γ is the unit cube with its faces glued by the generators
-(x+1, y, z + k y), (x, y+1, z) and (x, y, z+1) of Γ (VISGRAF TR-19-06, section 4). All three are
-affine, so a straight chord stays straight when it is carried into the neighbouring cell.
+The quotient Nil/Γ is a box with the edges A, B and C, its faces glued by the generators
+(x+A, y, z + k A y), (x, y+B, z) and (x, y, z+C) of Γ (VISGRAF TR-19-06, section 4, where the box is
+the unit cube). They close if n = k A B/C is an integer. All three are affine, so a straight chord
+stays straight when it is carried into the neighbouring cell.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ class Space:
     falls away: such a space is ``flat``. If it is ``general``, kernels do for the twist 0, too.
     """
 
+    EDGES = (1.0, 1.0, 1.0)  # A, B and C of the quotient's box, in cells
+
     def __init__(
         self,
         twist: float,
@@ -38,12 +41,15 @@ class Space:
         self.flat = twist == 0 and not general
         self.twist_number = twist
         self._twist = 0 if self.flat else dr.opaque(mi.Float, twist)
-        self._integer_twist = 0 if self.flat else dr.opaque(mi.Int32, round(twist))
+        a, b, c = self.EDGES
+        self._integer_twist = 0 if self.flat else dr.opaque(mi.Int32, round(twist * a * b / c))
         self.origin = opaque(mi.Point3f(*origin))
         self.size_number = size
         self.size = dr.opaque(mi.Float, size)
         self.cells_per_unit = dr.opaque(mi.Float, 1 / size)  # a division costs thirteen products
         self.largest = dr.opaque(mi.Float, max(map(abs, origin)))  # of the origin's coordinates
+        self.periods = opaque(mi.Vector3f(self.EDGES))
+        self.per_height = dr.opaque(mi.Float, 1 / self.EDGES[2])
         # A few units in the last place of the largest scene coordinate near the cube, in cells:
         # what Mitsuba's float32 arithmetic may lose at the joint of two chords.
         extent = 1 + max(abs(c) for c in origin) / size
@@ -57,6 +63,7 @@ class Space:
 
     @property
     def integer_twist(self) -> mi.Int32:
+        """n = k A B/C."""
         return mi.Int32(self._integer_twist)
 
     def to_cells(self, p: mi.Point3f) -> mi.Point3f:
@@ -68,15 +75,15 @@ class Space:
         return dr.fma(self.size, p, self.origin)
 
 
-def exit_through_face(p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3i]:
-    """Where the segment p + s d, 0 ≤ s ≤ 1, leaves the unit cube.
+def exit_through_face(p: mi.Point3f, d: mi.Vector3f, space: Space) -> tuple[mi.Float, mi.Vector3i]:
+    """Where the segment p + s d, 0 ≤ s ≤ 1, leaves the cell.
 
     Returns s (clipped to ≥ 0; > 1 if it does not leave) and the face as a vector with one entry
     of ±1. An edge or a corner is left through one face after the other, by steps of length 0.
     """
     inf = dr.inf
     s = [
-        dr.select(d[i] == 0, inf, (dr.select(d[i] > 0, mi.Float(1), 0) - p[i]) / d[i])
+        dr.select(d[i] == 0, inf, (dr.select(d[i] > 0, space.periods[i], 0) - p[i]) / d[i])
         for i in range(3)
     ]
     nearest = dr.minimum(s[0], dr.minimum(s[1], s[2]))
@@ -97,19 +104,24 @@ def through_face(
 ) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
     """Carry a point ``p`` on a face, ``others`` that belong to it and ``cell`` into the next cell.
 
-    ``face`` is zero in lanes that stay. Crossing x = 0 or 1 shears z by k y, which can leave
-    [0, 1) on either side whatever the direction of the ray, so z is reduced at once.
+    ``face`` is zero in lanes that stay. Crossing x = 0 or A shears z by k A y, which can leave
+    [0, C) on either side whatever the direction of the ray, so z is reduced at once.
     """
-    fx, fy, fz = (mi.Float(f) for f in face)
-    shear = space.twist * fx
+    edges = space.periods
+    step = mi.Vector3f(face) * edges
+    shear = space.twist * step.x
     q = mi.Point3f(
-        dr.select(face.x == 0, p.x, dr.select(face.x > 0, mi.Float(0), 1)),
-        dr.select(face.y == 0, p.y, dr.select(face.y > 0, mi.Float(0), 1)),
-        dr.select(face.z == 0, dr.fma(-shear, p.y, p.z), dr.select(face.z > 0, mi.Float(0), 1)),
+        dr.select(face.x == 0, p.x, dr.select(face.x > 0, 0, edges.x)),
+        dr.select(face.y == 0, p.y, dr.select(face.y > 0, 0, edges.y)),
+        dr.select(face.z == 0, dr.fma(-shear, p.y, p.z), dr.select(face.z > 0, 0, edges.z)),
     )
-    lift = dr.select(face.x == 0, 0, dr.floor(q.z))
-    q.z -= lift
-    moved = [mi.Point3f(o.x - fx, o.y - fy, dr.fma(-shear, o.y, o.z) - fz - lift) for o in others]
+    lift = dr.select(face.x == 0, 0, dr.floor(q.z * space.per_height))
+    drop = lift * edges.z
+    q.z -= drop
+    drop += step.z
+    moved = [
+        mi.Point3f(o.x - step.x, o.y - step.y, dr.fma(-shear, o.y, o.z) - drop) for o in others
+    ]
     g = mi.Vector3i(
         cell.x + face.x,
         cell.y + face.y,

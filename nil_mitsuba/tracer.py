@@ -251,7 +251,7 @@ class Tracer:
         along = mi.Vector3f(end - vertex)
         s_last, leaves, face = mi.Float(1), mi.Bool(False), mi.Vector3i(0)
         if self.space.quotient:
-            s_last, face = exit_through_face(vertex, along)
+            s_last, face = exit_through_face(vertex, along, self.space)
             leaves = s_last < 1
             s_last = dr.minimum(s_last, 1)
         speed2 = dr.squared_norm(along)
@@ -403,8 +403,8 @@ class Tracer:
                 along = geometry.from_frame(point, tangent, k)
                 s_first, s_last = -dr.minimum(window, at), dr.minimum(window, reach - at)
                 if quotient:
-                    s_first = dr.maximum(s_first, -exit_through_face(point, -along)[0])
-                    s_last = dr.minimum(s_last, exit_through_face(point, along)[0])
+                    s_first = dr.maximum(s_first, -exit_through_face(point, -along, space)[0])
+                    s_last = dr.minimum(s_last, exit_through_face(point, along, space)[0])
                 speed = dr.norm(along)
                 line = along / speed
                 # Nothing before the ray's own start, which may be close by its surface
