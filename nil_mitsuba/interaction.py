@@ -33,7 +33,7 @@ def surface_interaction(
     hit, ``wi`` points against the direction in which the segment *started*: environments are
     looked up by it.
     """
-    si = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
+    si = _in_scene(hit)
     si.wavelengths = wavelengths
     si.t = dr.select(hit.valid, hit.distance * space.size, dr.inf)
 
@@ -61,6 +61,22 @@ def surface_interaction(
     arrival = dr.select(same_side, hit.arrival, dr.normalize(mi.Vector3f(line)))
     incoming = dr.select(hit.valid, arrival, start_direction)
     si.wi = dr.select(hit.valid, si.to_local(-incoming), -incoming)
+    return si
+
+
+def _in_scene(hit: Hit) -> mi.SurfaceInteraction3f:
+    """Surface interaction in scene coordinates, as Mitsuba computes it for straight rays."""
+    if hit.triangle is None:
+        return hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
+    si = hit.triangle.interaction(hit.preliminary, hit.ray)
+    return _of_other_shapes(hit, si) if hit.triangle.others else si
+
+
+@dr.syntax
+def _of_other_shapes(hit: Hit, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+    other = hit.valid & ~hit.triangle.valid
+    if other:  # a branch: most packets of rays meet nothing but triangles
+        si = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, other)
     return si
 
 

@@ -13,6 +13,7 @@ from . import llvm
 VARIANT_MODULES = (
     "nil_mitsuba.quotient",
     "nil_mitsuba.shapes",
+    "nil_mitsuba.triangles",
     "nil_mitsuba.box",
     "nil_mitsuba.clearance",
     "nil_mitsuba.tracer",

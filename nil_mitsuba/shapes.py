@@ -54,6 +54,7 @@ class Shapes:
 
     def __init__(self, scene: mi.Scene):
         self.shapes = scene.shapes()
+        self.meshes = [shape for shape in self.shapes if shape.is_mesh()]
         # All are on their way before the first is waited for
         meshes = {i: _Triangles(shape) for i, shape in enumerate(self.shapes) if shape.is_mesh()}
         self.extents = [
@@ -86,7 +87,7 @@ class Shapes:
         )
         for place, i in enumerate(others):
             places[pointers[i]] = place << 1
-        place = len(others)
+        place = self.first_triangle = len(others)
         for i, triangles in meshes.items():
             places[pointers[i]] = place << 1 | 1
             place += triangles.count
@@ -98,21 +99,26 @@ class Shapes:
                 mi.Float([_shrinkage(self.shapes[i]) if instances[i] else 0 for i in others])
             )
 
+    def index(
+        self, shape: mi.ShapePtr, instance: mi.ShapePtr, prim_index: mi.UInt32, valid: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Bool]:
+        """Where the entry of what was hit is, and whether that is a triangle's."""
+        if self.has_instances:
+            shape = dr.select(instance != None, instance, shape)  # noqa: E711
+        place = dr.gather(mi.UInt32, self.places, dr.reinterpret_array(mi.UInt32, shape), valid)
+        by_triangle = (place & 1) == 1
+        index = place >> 1
+        if self.has_meshes:
+            index += dr.select(by_triangle, prim_index, 0)
+        return index, by_triangle
+
     def margin(self, si: mi.SurfaceInteraction3f, length: mi.Float) -> mi.Float:
         """How far (scene units) from a hit a ray has to start, not to meet the surface again.
 
         ``length`` (scene units) of the straight ray that hit counts where the hit depends on it.
         """
         valid = si.is_valid()
-        shape = si.shape
-        if self.has_instances:
-            instanced = si.instance != None  # noqa: E711
-            shape = dr.select(instanced, si.instance, shape)
-        place = dr.gather(mi.UInt32, self.places, dr.reinterpret_array(mi.UInt32, shape), valid)
-        index = place >> 1
-        if self.has_meshes:
-            by_triangle = (place & 1) == 1
-            index += dr.select(by_triangle, si.prim_index, 0)
+        index, by_triangle = self.index(si.shape, si.instance, si.prim_index, valid)
         largest = dr.gather(mi.Float, self.largest, index, valid)
         if self.has_others:
             if self.has_meshes:
@@ -123,6 +129,7 @@ class Shapes:
         kind = si.shape.shape_type()
         margin = dr.select((kind & PRECISE) != 0, ROUNDINGS, OTHER_ROUNDINGS) * ROUNDING * largest
         if self.has_instances:
+            instanced = si.instance != None  # noqa: E711
             radius = dr.norm(si.dp_dv) * dr.inv_pi
             shrinkage = dr.gather(mi.Float, self.shrinkage, index, valid & instanced)
             shrunk = dr.minimum(ROUNDINGS * ROUNDING * shrinkage, MOST_OF_RADIUS) * radius

@@ -19,6 +19,7 @@ from . import geometry
 from .box import Occupied, Passage
 from .quotient import Space, exit_through_face, opaque, through_face
 from .shapes import Shapes
+from .triangles import Triangle, Triangles
 
 # A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
 # rough bounces, and towards lights. What a chord has missed cannot be found again, while what it
@@ -52,7 +53,7 @@ class Hit:
 
     ``distance`` (cells) is arc length, ``arrival`` the frame direction there, ``cell`` the deck
     element of the copy that was hit, ``ray`` (scene) and ``preliminary`` what Mitsuba needs to
-    compute its surface interaction.
+    compute its surface interaction, ``triangle`` what is known of one without asking Mitsuba.
     """
 
     valid: mi.Bool
@@ -61,6 +62,7 @@ class Hit:
     cell: mi.Vector3i
     ray: mi.Ray3f
     preliminary: mi.PreliminaryIntersection3f
+    triangle: Triangle | None = None
 
 
 def random_of(p: mi.Point3f, v: mi.Vector3f) -> mi.Float:
@@ -161,10 +163,11 @@ class Tracer:
         # geodesic, 4e-6 of whose length of 10 cells they are off.
         self.least = opaque(dr.maximum(1e-4, 16 * space.slack))
         self.exact = opaque(dr.maximum(4e-6, 0.25 * space.slack))
+        shapes = shapes or Shapes(scene)
+        self.triangles = Triangles(shapes)
         if space.quotient:  # no ray leaves the cube
             return
-        extents = (shapes or Shapes(scene)).extents
-        self.occupied = Occupied((extent.box for extent in extents), space)
+        self.occupied = Occupied((extent.box for extent in shapes.extents), space)
 
     # ------------------------------------------------------------------ lengths
 
@@ -442,8 +445,15 @@ class Tracer:
             active = mi.Bool(redo)
 
         arrival = geometry.turned(v, turn * dr.select(valid, distance, 0))
+        found.valid = valid
         return Hit(
-            valid, dr.select(valid, distance, dr.inf), arrival, cell, line_ray(o, d, time), found
+            valid,
+            dr.select(valid, distance, dr.inf),
+            arrival,
+            cell,
+            line_ray(o, d, time),
+            found,
+            self.triangles.at(found),
         )
 
     @dr.syntax
