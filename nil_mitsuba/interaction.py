@@ -44,15 +44,9 @@ def surface_interaction(
         si.dp_dv = geometry.to_frame(p, si.dp_dv, k)
         si.n = unit_conormal(p, si.n, space)
 
-        # The shading tangent is a vector, the shading normal a covector: they stay orthogonal, but
-        # only one of them keeps its length, and the bitangent follows from both.
-        sh = si.sh_frame
-        s = geometry.to_frame(p, sh.s, k)
-        handedness = dr.dot(dr.cross(sh.n, sh.s), sh.t)
-        n = unit_conormal(p, sh.n, space)
-        s = dr.normalize(dr.fma(-n, dr.dot(n, s), s))
-        t = dr.mulsign(dr.cross(n, s), handedness)
-        si.sh_frame = mi.Frame3f(s, t, n)
+        # As Mitsuba does, but orthogonal in Nil: tangents are vectors, normals covectors
+        si.sh_frame.n = unit_conormal(p, si.sh_frame.n, space)
+        si.initialize_sh_frame()
 
     # A geodesic that only grazes a surface may turn away from it within the tolerance, where the
     # line that was traced goes through: what was hit from one side is seen from that side.
