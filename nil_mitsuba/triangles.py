@@ -78,7 +78,8 @@ class Triangle:
         si.time, si.wavelengths = ray.time, ray.wavelengths
         si.shape = dr.select(self.valid, pi.shape, dr.zeros(mi.ShapePtr))
         si.prim_index = pi.prim_index
-        b1, b2 = pi.prim_uv.x, pi.prim_uv.y
+        # Embree leaves any bits where a ray has met nothing
+        b1, b2 = dr.select(self.valid, pi.prim_uv, 0)
         si.p = dr.fma(self.e1, b1, dr.fma(self.e2, b2, self.p0))
         n = dr.cross(self.e1, self.e2)
         n.z = dr.select(self.valid, n.z, 1)  # no infinities where nothing was hit
@@ -176,7 +177,7 @@ class Triangles:
             mi.Point3f(*p[:3]),
             mi.Vector3f(*e1[:3]),
             mi.Vector3f(*e2[:3]),
-            p[3],
+            dr.select(valid, p[3], 1),
             uv or None,
             normals,
             self.shapes.has_others,
