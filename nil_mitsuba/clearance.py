@@ -80,8 +80,9 @@ class Clearance:
             self._keep(0, dr.maximum(self.grid.least - self.slack, 0))
             if levels:
                 self._add_levels(pieces, focus, finest, levels)
-        # Whether it is worth asking: the alternative are chords of about a twentieth of a cell
-        self.useful = dr.mean(self.table)[0] > WORTHWHILE
+        # Whether it is worth asking: the alternative are chords of about a twentieth of a cell.
+        # (A kernel for dr.mean would be another one for each size of the table.)
+        self.useful = dr.sum(self.table)[0] > WORTHWHILE * dr.width(self.table)
 
     def _keep(self, place, values):
         index = dr.arange(mi.UInt32, dr.width(values)) + opaque(mi.UInt32(place))
