@@ -30,6 +30,11 @@ OTHER_ROUNDINGS = 1500
 # instance is small: their relative error is some 16 roundings times the square of that length. As
 # a part of the radius, what is not given away to it; at a scale of 1/200 nothing is exact any more.
 MOST_OF_RADIUS = 1 / 8
+# Mitsuba 3.9.1 finds a B-spline curve's segment again from the v that a hit's place has been
+# rounded to, for the tangents there. At the end of the last one that is a segment too many, which
+# it reads from behind its table. The part of all segments that no rounding of v exceeds:
+WITHIN_SPLINE = 1 - 2**-22
+SPLINE = int(mi.ShapeType.BSplineCurve)
 
 
 @dataclass(frozen=True)
@@ -98,6 +103,24 @@ class Shapes:
             self.shrinkage = opaque(
                 mi.Float([_shrinkage(self.shapes[i]) if instances[i] else 0 for i in others])
             )
+        self._tabulate_splines(scene)
+
+    def _tabulate_splines(self, scene):
+        """Table by a pointer's number of how many segments from its start a curve may be hit."""
+        shapes = self.shapes
+        if self.has_instances:
+            shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
+        splines = [shape for shape in shapes if shape.shape_type() == SPLINE]
+        self.has_splines = bool(splines)
+        self.has_splines_in_instances = not set(splines) <= set(self.shapes)
+        if not splines:
+            return
+        pointers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in shapes]
+        lengths = [dr.inf] * (max(pointers) + 1)
+        for shape, pointer in zip(shapes, pointers):
+            if shape.shape_type() == SPLINE:
+                lengths[pointer] = WITHIN_SPLINE * shape.primitive_count()
+        self.spline_lengths = opaque(mi.Float(lengths))
 
     def index(
         self, shape: mi.ShapePtr, instance: mi.ShapePtr, prim_index: mi.UInt32, valid: mi.Bool
@@ -111,6 +134,28 @@ class Shapes:
         if self.has_meshes:
             index += dr.select(by_triangle, prim_index, 0)
         return index, by_triangle
+
+    def within_splines(
+        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
+    ) -> mi.PreliminaryIntersection3f:
+        """What ``ray`` has met, but a B-spline curve's last end by a rounding before it.
+
+        Of the end itself Mitsuba's surface interaction reads memory that may not be there.
+        """
+        if not self.has_splines:
+            return pi
+        valid, shape = pi.is_valid(), pi.shape
+        if self.has_splines_in_instances:  # only their interaction tells which shape that is
+            shape = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, valid).shape
+        number = dr.reinterpret_array(mi.UInt32, shape)
+        valid &= shape != None  # noqa: E711 - as an instance is
+        length = dr.gather(mi.Float, self.spline_lengths, number, valid)
+        beyond = valid & (pi.prim_uv.x + pi.prim_index > length)
+        segment = mi.UInt32(dr.select(beyond, length, 0))
+        pi = mi.PreliminaryIntersection3f(pi)
+        pi.prim_index = dr.select(beyond, segment, pi.prim_index)
+        pi.prim_uv.x = dr.select(beyond, length - segment, pi.prim_uv.x)
+        return pi
 
     def margin(self, si: mi.SurfaceInteraction3f, length: mi.Float) -> mi.Float:
         """How far (scene units) from a hit a ray has to start, not to meet the surface again.

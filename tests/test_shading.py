@@ -261,3 +261,51 @@ def test_emission_follows_the_attributes_of_a_mesh(rgb, name, tmp_path):
     if name == "face_color":
         # Faces of 0.3 and 0.5 in green and blue, or a share of them at the silhouette
         assert dr.all(~lit | (dr.abs(green / 0.3 - blue / 0.5) < 1e-4))
+
+
+@pytest.mark.parametrize("instanced", [False, True], ids=["alone", "in an instance"])
+def test_a_curve_runs_on_to_its_very_end(rgb, tmp_path, instanced):
+    """Tangents there are those of its last segment, not of what follows in memory."""
+    from nil_mitsuba.interaction import surface_interaction
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Cone, Tracer
+
+    # A coil that starts along y and ends along -x; of many segments, as places on those are rounded
+    # so much that not one hit in a million is at the end, but one in a thousand
+    points, turns, height, radius = 20_000, 100.25, 3.0, 1e-3
+    step = 2 * math.pi * turns / (points - 1)
+    file = tmp_path / "coil.txt"
+    file.write_text(
+        "\n".join(
+            f"{math.cos(step * i)} {math.sin(step * i)} {height * i / points} {radius}"
+            for i in range(points)
+        )
+    )
+    curve = {"type": "bsplinecurve", "filename": str(file)}
+    scene = {"type": "scene", "curve": curve}
+    if instanced:
+        ball = {"type": "sphere", "center": [5, 0, 0]}
+        scene = {
+            "type": "scene",
+            "group": {"type": "shapegroup", "ball": ball, "curve": curve},
+            "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+            "other": {"type": "sphere", "center": [-5, 0, 0]},
+        }
+    scene, space = mi.load_dict(scene), Space(0.0, False, [0.0, 0.0, 0.0], 1.0)
+    tracer = Tracer(scene, space, math.inf)
+    rng = mi.PCG32(200_000)
+    across = math.pi * rng.next_float32()
+    v = mi.Vector3f(0, dr.cos(across), -dr.sin(across))
+    # From above onto the last segments, three or so
+    p = mi.Point3f(4 * step * rng.next_float32(), 1, height) - 0.1 * v
+    hit = tracer.intersect(p, v, Cone(0, 1e-4), tracer.reach(p, v), mi.Bool(True))
+    # Says so, and reads zeros, where Dr.Jit would read from behind an array
+    with dr.scoped_set_flag(dr.JitFlag.Debug, True):
+        si = surface_interaction(hit, v, space, mi.Color0f())
+        dr.eval(si)
+    segments = points - 3
+    # Others have passed the end and met turns below
+    met = hit.valid & (hit.preliminary.prim_index >= segments - 5)
+    last = met & (hit.preliminary.prim_index == segments - 1)
+    assert dr.count(last & (hit.preliminary.prim_uv.x > 1 - 2**-21 * segments))[0] > 50
+    assert dr.all(~met | (dr.normalize(si.dp_dv).x < -0.9))
