@@ -26,8 +26,8 @@ BLOCK = 16384
 OFF = 1e-3
 
 
-class Rays:
-    """Camera rays of a setup and what they hit in truth, up to the longest of ``LENGTHS``."""
+class CameraRays:
+    """Camera rays of a setup."""
 
     def __init__(self, setup, width):
         self.setup, self.width = setup, width
@@ -55,6 +55,35 @@ class Rays:
         self.p = mi.Point3f(p)
         dr.eval(self.p, self.v, self.cone)
 
+    def usable(self, length):
+        """Which rays are traced up to this length."""
+        return dr.full(truth.Bool, True, self.width**2)
+
+    def indices(self, length):
+        """The rays as indices; if there is a mirror, those that meet it.
+
+        Neighbours in a row stay neighbours, as in a render. Rows are in such an order that every
+        block has some from all parts of the image, and the number of blocks is even if there is
+        more than one: so two threads have the same to do.
+        """
+        usable = self.usable(length)
+        place, groups = dr.arange(truth.UInt32, self.width**2), 8
+        row, column = place // self.width, place % self.width
+        row = row % (self.width // groups) * groups + row // (self.width // groups)
+        order = row * self.width + column
+        order = dr.gather(truth.UInt32, order, dr.compress(dr.gather(truth.Bool, usable, order)))
+        found = dr.width(order)
+        count = found // (2 * BLOCK) * 2 * BLOCK or found
+        # Evenly spread over those that were found
+        chosen = dr.arange(truth.Float64, count) * (found / count)
+        return mi.UInt32(dr.gather(truth.UInt32, order, truth.UInt32(chosen)))
+
+
+class Rays(CameraRays):
+    """Camera rays of a setup and what they hit in truth, up to the longest of ``LENGTHS``."""
+
+    def __init__(self, setup, width):
+        super().__init__(setup, width)
         wide = [Array3f64(*(Float64(dr.detach(c)) for c in x)) for x in (self.p, self.v)]
         exact = truth.first_hit(setup.surfaces, *wide, LENGTHS[-1], TWIST, setup.quotient)
         self.first_t, self.on_mirror = exact.t, dr.full(truth.Bool, True, width * width)
@@ -87,24 +116,10 @@ class Rays:
         hit.t = hit.t + OFF
         return hit
 
-    def indices(self, length):
-        """The rays as indices; if there is a mirror, those that meet it.
-
-        Neighbours in a row stay neighbours, as in a render. Rows are in such an order that every
-        block has some from all parts of the image, and the number of blocks is even if there is
-        more than one: so two threads have the same to do.
-        """
-        usable = self.on_mirror & (self.first_t < length if self.setup.mirror is not None else True)
-        place, groups = dr.arange(truth.UInt32, self.width**2), 8
-        row, column = place // self.width, place % self.width
-        row = row % (self.width // groups) * groups + row // (self.width // groups)
-        order = row * self.width + column
-        order = dr.gather(truth.UInt32, order, dr.compress(dr.gather(truth.Bool, usable, order)))
-        found = dr.width(order)
-        count = found // (2 * BLOCK) * 2 * BLOCK or found
-        # Evenly spread over those that were found
-        chosen = dr.arange(truth.Float64, count) * (found / count)
-        return mi.UInt32(dr.gather(truth.UInt32, order, truth.UInt32(chosen)))
+    def usable(self, length):
+        if self.setup.mirror is None:
+            return super().usable(length)
+        return self.on_mirror & (self.first_t < length)
 
 
 @dataclass
