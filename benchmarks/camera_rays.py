@@ -22,7 +22,7 @@ def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH, m
     from nil_mitsuba.tracer import Tracer
 
     space = Space(twist, quotient, [0, 0, 0], 1.0)
-    tracer = (make or Tracer)(scene, space, 12.0)
+    tracer = make(scene, space, 12.0) if make else Tracer(scene, space, 12.0, focus=origin)
     sensor = mi.load_dict(
         {
             "type": "perspective",

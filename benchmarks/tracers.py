@@ -25,16 +25,16 @@ def allowance(t, twist):
     return (2e-5 + 2e-6 * t) * math.sqrt(1 + twist**2)
 
 
-def package(scene, space, max_distance, shapes=None):
+def package(scene, space, max_distance, shapes=None, focus=None):
     from nil_mitsuba.tracer import Tracer
 
-    return Tracer(scene, space, max_distance, shapes)
+    return Tracer(scene, space, max_distance, shapes, focus)
 
 
 def chords(method, knob):
     """What makes a tracer by a method of ``tracing_methods``, which needs a variant."""
 
-    def make(scene, space, max_distance, shapes=None):
+    def make(scene, space, max_distance, shapes=None, focus=None):
         from .tracing_methods import METHODS, ChordTracer
 
         return ChordTracer(scene, space, max_distance, METHODS[method], knob, shapes)

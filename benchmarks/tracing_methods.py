@@ -10,11 +10,13 @@ is imported.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from nil_mitsuba import geometry
-from nil_mitsuba.quotient import through_face
+from nil_mitsuba.quotient import exit_through_face, through_face
 from nil_mitsuba.tracer import Hit, Tracer, line_ray
 
 from . import report_formulas
@@ -226,6 +228,25 @@ class PrintedForm(ClosedForm):
         return report_formulas.geodesic(p, v, t, self.twist)
 
 
+@dataclass
+class Piece:
+    """What of a chord lies in one cell.
+
+    ``along`` is the whole chord and ``length`` (cells) its length, ``part`` the fraction of it that
+    is inside, and ``face`` the one through which it ``leaves``, if it does. A ray along it starts
+    at ``o`` (scene), by ``before`` (cells) ahead of the chord, in direction ``d``.
+    """
+
+    along: mi.Vector3f
+    length: mi.Float
+    part: mi.Float
+    leaves: mi.Bool
+    face: mi.Vector3i
+    o: mi.Point3f
+    d: mi.Vector3f
+    before: mi.Float
+
+
 class ChordTracer(Tracer):
     """First hits and occlusion on the chords that ``method`` makes of a geodesic.
 
@@ -236,6 +257,29 @@ class ChordTracer(Tracer):
     def __init__(self, scene, space, max_distance, method, knob, shapes=None):
         super().__init__(scene, space, max_distance, shapes)
         self.method = method(dr.opaque(mi.Float, knob), space.twist)
+
+    def piece(
+        self, vertex: mi.Point3f, end: mi.Point3f, direction: mi.Vector3f, t0: mi.Float
+    ) -> Piece:
+        """What of the chord from ``vertex`` (at arc length t0) to ``end`` lies in this cell.
+
+        ``direction`` is taken for that of a chord without length.
+        """
+        along = mi.Vector3f(end - vertex)
+        s_last, leaves, face = mi.Float(1), mi.Bool(False), mi.Vector3i(0)
+        if self.space.quotient:
+            s_last, face = exit_through_face(vertex, along, self.space)
+            leaves = s_last < 1
+            s_last = dr.minimum(s_last, 1)
+        speed2 = dr.squared_norm(along)
+        inv_speed = dr.rsqrt(speed2)
+        speed = speed2 * inv_speed
+        speed = dr.select(speed2 > 0, speed, 0)
+        d = dr.select(speed2 > 0, along * inv_speed, direction)
+        # Pieces overlap by the rounding of their joint, but none reaches behind the start.
+        before = dr.select(t0 > 0, self.space.slack, 0)
+        o = self.space.to_scene(vertex - before * d)
+        return Piece(along, speed, s_last, leaves, face, o, d, before)
 
     def intersect(self, p, v, cone, reach, active, time=0):
         """First hit of the geodesic from ``p`` in frame direction ``v`` within ``reach``."""
@@ -332,6 +376,7 @@ class ChordTracer(Tracer):
             cell=cell,
             ray=ray_found,
             preliminary=found,
+            triangle=self.triangles.at(found),
         )
 
 

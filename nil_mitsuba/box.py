@@ -53,7 +53,7 @@ class Passage:
         fall = dr.select(m2 > c, dr.minimum(fall, dr.fma(2 * m2, c, -0.5 * dr.pi * c2)), fall)
         self.dip = fall * dr.rcp(dr.maximum(k * w * w, 1e-30))
         self.period = 2 * dr.pi / dr.maximum(k * w, 1e-12)
-        self.gain = self.period * dr.fma(0.5 * c2, dr.rcp(dr.maximum(w, 1e-12)), w)
+        self.per_gain = dr.rcp(self.period * dr.fma(0.5 * c2, dr.rcp(dr.maximum(w, 1e-12)), w))
 
 
 class Box:
@@ -66,6 +66,10 @@ class Box:
     def excludes(self, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies outside."""
         return dr.any((p < self.lower) | (p > self.upper))
+
+    def gap(self, p: mi.Point3f) -> mi.Float:
+        """No more than the distance (cells) of a point from the box; not positive inside."""
+        return dr.max(dr.maximum(self.lower - p, p - self.upper))
 
     def clearance(self, p: mi.Point3f, v: mi.Vector3f, passage: Passage) -> mi.Float:
         """Arc length (cells) for which the geodesic at ``p`` in direction ``v`` stays outside.
@@ -81,14 +85,15 @@ class Box:
             gap = dr.maximum(below[i], above[i])
             away = dr.select(above[i] > 0, velocity[i], -velocity[i])
             root = dr.sqrt(dr.maximum(dr.fma(away, away, 2 * most * gap), 0))
-            back = dr.select(away > 0, (away + root) / most, 2 * gap / (root - away))
+            leaving = away > 0
+            back = dr.select(leaving, away + root, 2 * gap) / dr.select(leaving, most, root - away)
             free = dr.maximum(free, dr.select(gap > 0, back, 0))
 
         # In the mean z moves up (down, if w < 0): away from the box it comes back only by a dip,
         # towards the box it takes so many turns.
         gap = dr.maximum(below.z, above.z)
         leaves = (above.z > 0) == passage.upward
-        turns = dr.floor(dr.maximum(gap - passage.dip, 0) / passage.gain)
+        turns = dr.floor(dr.maximum(gap - passage.dip, 0) * passage.per_gain)
         free = dr.maximum(free, dr.select((gap > 0) & ~leaves, turns * passage.period, 0))
         never = (gap > passage.dip) & (gap > 0) & leaves
         never |= self._beside(passage)
@@ -131,6 +136,10 @@ class Occupied:
     def excludes(self, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies outside of all."""
         return dr.all([box.excludes(p) for box in self.boxes], axis=0)
+
+    def gap(self, p: mi.Point3f) -> mi.Float:
+        """`Box.gap` of the nearest one."""
+        return dr.min([box.gap(p) for box in self.boxes], axis=0)
 
     def clearance(self, p: mi.Point3f, v: mi.Vector3f, passage: Passage) -> mi.Float:
         """`Box.clearance`, of whichever box comes first."""

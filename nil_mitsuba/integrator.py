@@ -87,9 +87,12 @@ class NilIntegrator(ADIntegrator):
             dr.eval(image)
         return image
 
-    def view(self, scene: mi.Scene, general: bool = False) -> View:
-        """The scene as this integrator's parameters show it; ``general`` as of `Space`."""
-        view = View(scene, self, general)
+    def view(
+        self, scene: mi.Scene, general: bool = False, focus: mi.ScalarPoint3f | None = None
+    ) -> View:
+        """The scene as this integrator's parameters show it; ``general`` as of `Space`, ``focus``
+        as of `Clearance`."""
+        view = View(scene, self, general, focus)
         _warn_of_what_is_ignored(scene, view.shapes, self)
         return view
 
@@ -357,7 +360,13 @@ def _warn_of_what_is_ignored(scene, shapes, integrator):
 class View:
     """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
 
-    def __init__(self, scene: mi.Scene, integrator: NilIntegrator, general: bool = False):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        integrator: NilIntegrator,
+        general: bool = False,
+        focus: mi.ScalarPoint3f | None = None,
+    ):
         if dr.flag(dr.JitFlag.FreezingScope):
             raise RuntimeError(
                 'the integrator "nil" takes numbers from the scene that a frozen function would '
@@ -372,7 +381,7 @@ class View:
             general,
         )
         self.shapes = Shapes(scene)
-        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes)
+        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes, focus)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
         self.layers = [layer for layer in integrator.layers if LAYERS[layer].rule != "count"]

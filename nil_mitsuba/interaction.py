@@ -12,6 +12,7 @@ import mitsuba as mi
 from . import geometry
 from .quotient import Space
 from .tracer import Hit
+from .triangles import Triangle
 
 
 def unit_conormal(p: mi.Point3f, n: mi.Normal3f, space: Space) -> mi.Normal3f:
@@ -63,12 +64,14 @@ def _in_scene(hit: Hit) -> mi.SurfaceInteraction3f:
     if hit.triangle is None:
         return hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, hit.valid)
     si = hit.triangle.interaction(hit.preliminary, hit.ray)
-    return _of_other_shapes(hit, si) if hit.triangle.others else si
+    return _of_other_shapes(hit, hit.triangle, si) if hit.triangle.others else si
 
 
 @dr.syntax
-def _of_other_shapes(hit: Hit, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-    other = hit.valid & ~hit.triangle.valid
+def _of_other_shapes(
+    hit: Hit, triangle: Triangle, si: mi.SurfaceInteraction3f
+) -> mi.SurfaceInteraction3f:
+    other = hit.valid & ~triangle.valid
     if other:  # a branch: most packets of rays meet nothing but triangles
         si = hit.preliminary.compute_surface_interaction(hit.ray, mi.RayFlags.All, other)
     return si

@@ -95,7 +95,9 @@ class Passes:
             self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
             self.wavefront = math.ceil(pixels / self.tiles) * self.spp
 
-        self.view = integrator.view(scene, general)
+        to_world = self.sensor.world_transform().matrix
+        focus = mi.ScalarPoint3f([to_world[i, 3][0] for i in range(3)])
+        self.view = integrator.view(scene, general, focus)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
         self.film.prepare(channel_names(self.layers, "mean"))
 
@@ -159,7 +161,9 @@ class Passes:
                 # Recorded while the one before it is traced, but not begun; and recorded once. To
                 # look for what its loops leave as it is, Dr.Jit would record each of them again,
                 # those inside others four times and more, and LLVM finds the same.
-                with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+                with dr.scoped_set_flag(
+                    dr.JitFlag.OptimizeLoops, bool(int(__import__("os").environ.get("OL", "0")))
+                ):
                     add, lanes_of_next = self._record(index, self.done + lanes)
                 self._finish(lanes, start)
                 start, lanes = perf_counter(), lanes_of_next

@@ -49,7 +49,7 @@ class Space:
         self.cells_per_unit = dr.opaque(mi.Float, 1 / size)  # a division costs thirteen products
         self.largest = dr.opaque(mi.Float, max(map(abs, origin)))  # of the origin's coordinates
         self.periods = opaque(mi.Vector3f(self.EDGES))
-        self.per_height = dr.opaque(mi.Float, 1 / self.EDGES[2])
+        self.per_period = opaque(mi.Vector3f([1 / edge for edge in self.EDGES]))
         # A few units in the last place of the largest scene coordinate near the cube, in cells:
         # what Mitsuba's float32 arithmetic may lose at the joint of two chords.
         extent = 1 + max(abs(c) for c in origin) / size
@@ -115,7 +115,7 @@ def through_face(
         dr.select(face.y == 0, p.y, dr.select(face.y > 0, 0, edges.y)),
         dr.select(face.z == 0, dr.fma(-shear, p.y, p.z), dr.select(face.z > 0, 0, edges.z)),
     )
-    lift = dr.select(face.x == 0, 0, dr.floor(q.z * space.per_height))
+    lift = dr.select(face.x == 0, 0, dr.floor(q.z * space.per_period.z))
     drop = lift * edges.z
     q.z -= drop
     drop += step.z
@@ -128,6 +128,28 @@ def through_face(
         cell.z + face.z + mi.Int32(lift) + space.integer_twist * cell.x * face.y,
     )
     return q, moved, g
+
+
+def into_cell(
+    p: mi.Point3f, others: list[mi.Point3f], cell: mi.Vector3i, active: mi.Bool, space: Space
+) -> tuple[mi.Point3f, list[mi.Point3f], mi.Vector3i]:
+    """Carry a point ``p`` that may lie in any cell into the first one, as `through_face` does."""
+    edges = space.periods
+    inverse = space.per_period
+    fx = dr.select(active, dr.floor(p.x * inverse.x), 0)
+    fy = dr.select(active, dr.floor(p.y * inverse.y), 0)
+    step_x, step_y = fx * edges.x, fy * edges.y
+    shear = space.twist * step_x
+    y = p.y - step_y
+    z = dr.fma(-shear, y, p.z)
+    fz = dr.select(active, dr.floor(z * inverse.z), 0)
+    step_z = fz * edges.z
+    moved = [
+        mi.Point3f(o.x - step_x, o.y - step_y, dr.fma(-shear, o.y - step_y, o.z) - step_z)
+        for o in others
+    ]
+    g = multiply_cells(cell, mi.Vector3i(fx, fy, fz), space)
+    return mi.Point3f(p.x - step_x, y, z - step_z), moved, g
 
 
 def multiply_cells(g: mi.Vector3i, h: mi.Vector3i, space: Space) -> mi.Vector3i:

@@ -65,7 +65,7 @@ class Triangle:
             dr.fma(dr.dot(dr.cross(rest, self.e2), n), inverse, b.x),
             dr.fma(dr.dot(dr.cross(self.e1, rest), n), inverse, b.y),
         )
-        step /= space.size
+        step *= space.cells_per_unit
         inside = (b.x >= 0) & (b.y >= 0) & (b.x + b.y <= 1)
         return step, b, self.valid & inside & (dr.abs(step) < LONGEST_STEP)
 

@@ -99,8 +99,8 @@ def rendered(scene, setup, method, knob, spp, seed):
         }
     )
 
-    def tracer(scene, space, max_distance, shapes):
-        return tracer_of(method, knob, scene, space, max_distance, shapes)
+    def tracer(scene, space, max_distance, shapes, focus):
+        return tracer_of(method, knob, scene, space, max_distance, shapes, focus)
 
     with mock.patch.object(integrator, "Tracer", tracer):
         return timed(lambda: mi.render(scene, integrator=renderer, spp=spp, seed=seed))

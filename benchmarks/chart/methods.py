@@ -23,10 +23,10 @@ KNOBS = {
 DEFAULT = mi.load_dict({"type": "nil"}).tolerance
 
 
-def tracer_of(method, knob, scene, space, max_distance=math.inf, shapes=None):
-    """A tracer with one setting of the method's knob."""
+def tracer_of(method, knob, scene, space, max_distance=math.inf, shapes=None, focus=None):
+    """A tracer with one setting of the method's knob; ``focus``: where the camera is."""
     if method == PACKAGE:
-        return Tracer(scene, space, max_distance, shapes)
+        return Tracer(scene, space, max_distance, shapes, focus)
     return ChordTracer(scene, space, max_distance, METHODS[method], knob, shapes)
 
 
@@ -66,7 +66,7 @@ def measure(rays, length, rounds, most):
             if chords_expected(method, knob, length) > most:
                 continue
             tolerance = knob if method == PACKAGE else 1.0
-            tracer = tracer_of(method, knob, rays.scene, rays.space)
+            tracer = tracer_of(method, knob, rays.scene, rays.space, focus=rays.setup.origin)
             row = {
                 "scene": rays.setup.kind,
                 "space": rays.setup.space,
