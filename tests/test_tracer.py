@@ -28,7 +28,7 @@ def test_every_ray_names_the_true_surface(rgb, kind, twist):
     assert close <= LIMITS[kind][0]
     assert error <= LIMITS[kind][1]
     finer = compare(rgb, kind, twist, 0.25 / 4)
-    assert twist == 0 or finer[1] < close
+    assert twist == 0 or finer[1] < close or finer[1] == close == 0
 
 
 def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
