@@ -161,9 +161,7 @@ class Passes:
                 # Recorded while the one before it is traced, but not begun; and recorded once. To
                 # look for what its loops leave as it is, Dr.Jit would record each of them again,
                 # those inside others four times and more, and LLVM finds the same.
-                with dr.scoped_set_flag(
-                    dr.JitFlag.OptimizeLoops, bool(int(__import__("os").environ.get("OL", "0")))
-                ):
+                with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
                     add, lanes_of_next = self._record(index, self.done + lanes)
                 self._finish(lanes, start)
                 start, lanes = perf_counter(), lanes_of_next

@@ -6,8 +6,8 @@ outside of the curve, at places that differ from ray to ray, so that the polygon
 sides alike: on average a surface is met as often as it should be. What a chord has met tells where
 to look: the hit is where the geodesic meets the plane of that triangle or, if that is beside the
 triangle or the surface is bent, where its tangent line meets the surface. Where the tangent finds
-nothing (silhouettes, contacts, grazing rays), the chord's own hit stands. Everything in this file
-is in cell coordinates unless it says "scene".
+nothing (silhouettes, contacts, grazing rays), the chord is cut and tried again. Everything in this
+file is in cell coordinates unless it says "scene".
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ START = 0.4
 # chord behind, off by 4/3 τ − 2 τ² + 2/3 τ³ + 2/3 τ log τ. A shorter one does not reach that far
 # out, or grazing rays would meet what they leave: no farther than chords so many times as long do.
 CORNER, STEEPEST = 2 / 3, 4
-# A leap takes a tenth of a query's time, or less.
+# Leaps are worth it down to this part of a chord: each takes 8 to 12 ns, where a query takes 50.
 LEAST_LEAP = 0.25
 
 
@@ -174,7 +174,7 @@ class Chords:
         """
         room = self.room(2 * remaining)
         towards = 4 * room / dr.maximum(self._root(room) + self.spread, 1e-20)
-        return dr.maximum(dr.minimum(self.after(t), towards), self.least)
+        return dr.maximum(dr.minimum(self.after(t), towards), self.shortest(t))
 
     def _root(self, room: mi.Float) -> mi.Float:
         return dr.sqrt(dr.fma(2 * self.across, room, dr.square(self.spread)))
@@ -391,7 +391,9 @@ class Tracer:
     ) -> Hit:
         """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` within ``reach``.
 
-        In the quotient ``p`` lies in the unit cube.
+        In the quotient ``p`` lies in the unit cube. A hit of a ray that is seen lies off the
+        geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more; where the geodesic
+        only just misses what its chord meets, by the chord's error, which keeps within the cone.
         """
         if self.space.flat and not self.space.quotient:
             hit = self._straight(p, v, reach, active, time)
@@ -504,7 +506,7 @@ class Tracer:
             error = 0.5 * chords.across * dr.square(step)
             good &= (distance + step >= 0) & (cone.soft | (error <= goal))
             if dr.hint(space.quotient, mode="scalar"):
-                # What lies end a face is another copy
+                # What lies beyond a face is another copy
                 end = mi.Point3f(dr.fma(lead, step, near))
                 good &= dr.all((end >= 0) & (end <= mi.Point3f(space.periods)))
             found.prim_uv = dr.select(good, b, found.prim_uv)

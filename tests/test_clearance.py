@@ -96,29 +96,28 @@ def distances(p, q, space):
     return dr.sqrt(best)
 
 
+def check_distances(scene, clearance, p, lower, upper, least_mean):
+    """No surface between ``lower`` and ``upper`` is closer to p than is said, which is not 0."""
+    says = clearance.at(p)
+    least = distances(p, points_on(scene, lower, upper), clearance.space)
+    assert not dr.any(Float64(says) > least + ROUNDING)[0]
+    assert dr.mean(says)[0] > least_mean
+
+
 @pytest.mark.parametrize("twist", TWISTS)
 def test_no_surface_and_no_image_of_one_lies_closer_than_a_cell_says(rgb, twist):
     scene = mi.load_dict(lattice())
     clearance = clearance_of(scene, twist)
-    p = points_in((0, 0, 0), (1, 1, 1), 1)
-    says, least = (
-        clearance.at(p),
-        distances(p, points_on(scene, (0, 0, 0), (1, 1, 1)), clearance.space),
+    check_distances(
+        scene, clearance, points_in((0, 0, 0), (1, 1, 1), 1), (0, 0, 0), (1, 1, 1), 0.05
     )
-    assert not dr.any(Float64(says) > least + ROUNDING)[0]
-    assert dr.mean(says)[0] > 0.05
 
 
 def test_no_surface_lies_closer_than_a_plain_scene_says(rgb):
     scene = mi.load_dict(ground())
     clearance = clearance_of(scene, quotient=False)
     p = points_in((-6, -6, -1), (6, 6, 3), 2)  # inside of the scene's box and outside
-    says, least = (
-        clearance.at(p),
-        distances(p, points_on(scene, (-4, -4, -0.1), (4, 4, 2)), clearance.space),
-    )
-    assert not dr.any(Float64(says) > least + ROUNDING)[0]
-    assert dr.mean(says)[0] > 0.5
+    check_distances(scene, clearance, p, (-4, -4, -0.1), (4, 4, 2), 0.5)
 
 
 def others(folder):
@@ -174,13 +173,9 @@ def test_each_voxel_that_a_surface_touches_is_marked(rgb, monkeypatch, tmp_path,
 def test_curves_and_instances_keep_their_distance(rgb, tmp_path, quotient):
     scene = mi.load_dict(others(tmp_path))
     clearance = clearance_of(scene, 2.0, quotient)
-    p = points_in((0, 0, 0), (1, 1, 1), 1)
-    says, least = (
-        clearance.at(p),
-        distances(p, points_on(scene, (0, 0, 0), (1, 1, 1)), clearance.space),
+    check_distances(
+        scene, clearance, points_in((0, 0, 0), (1, 1, 1), 1), (0, 0, 0), (1, 1, 1), 0.03
     )
-    assert not dr.any(Float64(says) > least + ROUNDING)[0]
-    assert dr.mean(says)[0] > 0.03
 
 
 @pytest.mark.parametrize("origin, size", [((0, 0, 0), 1), ((-30, 20, 7), 0.5)])

@@ -55,6 +55,23 @@ def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
     assert dr.allclose(hit.distance, 5)
 
 
+def test_a_shadow_ray_ends_at_a_light_thousands_of_cells_away(rgb):
+    """Near the light its chords are shorter than what float32 can add to its arc length."""
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Cone, Tracer
+
+    mi = rgb
+    balls = {f"s{z}": {"type": "sphere", "center": [0, 0, z], "radius": 0.1} for z in (0, 5000)}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 4990])}
+    for scene, expected in ((balls, False), (balls | {"wall": wall}, True)):
+        tracer = Tracer(
+            mi.load_dict({"type": "scene"} | scene), Space(1.0, False, [0] * 3, 1.0), dr.inf
+        )
+        p, v = mi.Point3f(0, 0, 0.2), mi.Vector3f(0, 0, 1)
+        blocked = tracer.occluded(p, p, v, Cone(0, 1e-9), mi.Float(4999), mi.Bool(True))
+        assert blocked[0] == expected
+
+
 def check_that_rays_end(mi, p, v, twist):
     """Each ray ends by a hit within the cube or at ``max_distance``, with finite values."""
     from nil_mitsuba.interaction import surface_interaction
