@@ -29,6 +29,7 @@ TESTED_BY = {
 QUICK = (
     "benchmarks.camera_rays",
     "benchmarks.speed",
+    "benchmarks.accuracy",
     "benchmarks.emitter_sampling",
     "benchmarks.stills",
 )
