@@ -87,12 +87,10 @@ class NilIntegrator(ADIntegrator):
             dr.eval(image)
         return image
 
-    def view(
-        self, scene: mi.Scene, general: bool = False, focus: mi.ScalarPoint3f | None = None
-    ) -> View:
-        """The scene as this integrator's parameters show it; ``general`` as of `Space`, ``focus``
-        as of `Clearance`."""
-        view = View(scene, self, general, focus)
+    def view(self, scene: mi.Scene, general: bool = False, sensor: mi.Sensor | None = None) -> View:
+        """The scene as this integrator's parameters show it; ``general`` as of `Space`, ``sensor``
+        the one around which empty space is known best."""
+        view = View(scene, self, general, sensor)
         _warn_of_what_is_ignored(scene, view.shapes, self)
         return view
 
@@ -365,7 +363,7 @@ class View:
         scene: mi.Scene,
         integrator: NilIntegrator,
         general: bool = False,
-        focus: mi.ScalarPoint3f | None = None,
+        sensor: mi.Sensor | None = None,
     ):
         if dr.flag(dr.JitFlag.FreezingScope):
             raise RuntimeError(
@@ -381,6 +379,10 @@ class View:
             general,
         )
         self.shapes = Shapes(scene)
+        focus = None
+        if sensor is not None:
+            to_world = sensor.world_transform().matrix
+            focus = mi.ScalarPoint3f([to_world[i, 3][0] for i in range(3)])
         self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes, focus)
         self.lights = Lights(scene, self.space, integrator.max_distance)
         self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)

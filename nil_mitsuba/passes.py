@@ -95,9 +95,7 @@ class Passes:
             self.tiles = math.ceil(pixels / max(1, TILE_SAMPLES // self.spp))
             self.wavefront = math.ceil(pixels / self.tiles) * self.spp
 
-        to_world = self.sensor.world_transform().matrix
-        focus = mi.ScalarPoint3f([to_world[i, 3][0] for i in range(3)])
-        self.view = integrator.view(scene, general, focus)
+        self.view = integrator.view(scene, general, self.sensor)
         self.camera = Camera(self.sensor, self.view.space, integrator.tolerance)
         self.film.prepare(channel_names(self.layers, "mean"))
 
