@@ -504,7 +504,8 @@ class Tracer:
             lead = geometry.from_frame(near, arrival, k)
             step, b, good = cast(Triangle, triangle).onto_plane(found.prim_uv, near, lead, space)
             error = 0.5 * chords.across * dr.square(step)
-            good &= (distance + step >= 0) & (cone.soft | (error <= goal))
+            good &= (distance + step >= 0) & (distance + step <= reach)
+            good &= cone.soft | (error <= goal)
             if dr.hint(space.quotient, mode="scalar"):
                 # What lies beyond a face is another copy
                 end = mi.Point3f(dr.fma(lead, step, near))
