@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .files import replacing
-from .sums import Sums, name_passes
+from .sums import Sums, name_noise, name_passes
 
 # The number is that of the format. JSON text follows, with its length before it, then the arrays
 # in the order in which it lists them, and the SHA-256 of all that.
@@ -39,13 +39,15 @@ class Checkpoint:
 
     ``settings`` is what has to be equal for sums to be added up (names, texts, numbers, and lists
     and dictionaries of them); ``seconds`` the time that rendering took;
-    ``about`` what a picture's metadata tell besides.
+    ``about`` what a picture's metadata tell besides; ``noise`` the estimate of ``stills.noise``,
+    None where there is none or no one has made it, as after an addition.
     """
 
     settings: dict
     sums: Sums
     seconds: float = 0.0
     about: dict = field(default_factory=dict)
+    noise: float | None = None
 
     def plus(self, other: Checkpoint) -> Checkpoint:
         """Both together; raises ValueError if they do not belong together or overlap."""
@@ -84,7 +86,9 @@ class Checkpoint:
             start = stop
         dr.eval(arrays)
         sums = Sums(passes=tuple(map(tuple, header["passes"])), **arrays)
-        return Checkpoint(header["settings"], sums, header["seconds"], header["about"])
+        return Checkpoint(
+            header["settings"], sums, header["seconds"], header["about"], header.get("noise")
+        )
 
     def _blocks(self) -> Iterator[bytes | memoryview]:
         if sys.byteorder != "little":
@@ -95,6 +99,7 @@ class Checkpoint:
                 "settings": self.settings,
                 "about": self.about,
                 "seconds": self.seconds,
+                "noise": self.noise,
                 "passes": self.sums.passes,
                 "arrays": {key: tensor.shape for key, tensor in tensors.items()},
             }
@@ -128,7 +133,13 @@ def peek(path: str | os.PathLike) -> dict:
 def describe(path: str | os.PathLike) -> str:
     """What a checkpoint holds, as text; raises OSError and ValueError as ``load`` does."""
     header = _header(_read(path), f'"{path}"')[0]
-    lines = {"passes": name_passes(header["passes"]), "renderTime": header["seconds"]}
+    passes = header["passes"]
+    lines = {
+        "passes": name_passes(passes),
+        # Those of earlier versions hold no estimate
+        "noise": name_noise(header.get("noise"), sum(stop - first for first, stop in passes)),
+        "renderTime": header["seconds"],
+    }
     lines |= header["about"]
     for key, value in header["settings"].items():
         lines |= value if isinstance(value, dict) else {key: value}

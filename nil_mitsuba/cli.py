@@ -13,6 +13,7 @@ import signal
 import stat
 import sys
 import tempfile
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .registration import refusal
 from .signals import Watch
-from .sums import name_passes
+from .sums import name_noise, name_passes
 
 SUMS = ".sums"  # suffix of checkpoints and parts
 
@@ -345,6 +346,7 @@ def merge(parts, output, **picture):
 
     _set_variant(checkpoint.peek(parts[0])["variant"])
     state = checkpoint.load(parts[0])
+    film = state.settings["film"]
     commands = [state.about.get("commandLine")]
     for part in parts[1:]:
         try:
@@ -361,6 +363,8 @@ def merge(parts, output, **picture):
     # All that it took, line by line as in a script
     commands.append(shlex.join(["nil-mitsuba", *sys.argv[1:]]))
     state.about["commandLine"] = "\n".join(dict.fromkeys(filter(None, commands)))
+    if film["pixel_format"]:  # as pictures have that parts can be merged to
+        state.noise = stills.noise(stills.film_of(film), state.sums)
     if sums_only:
         checkpoint.save(exr_path, state)
     else:
@@ -369,6 +373,7 @@ def merge(parts, output, **picture):
             _require_guides(state.settings)
         out = options.output_to(exr_path, png_path, tuple(state.settings["layers"]))
         out.write(stills.picture_of(state), metadata_of(state))
+    _note(_ending(state, options.denoise))
     for path in filter(None, (exr_path, png_path)):
         click.echo(path)
 
@@ -519,8 +524,8 @@ def _render_still(
         if not (options.clustered or options.quiet):  # a cluster is not waited for
             stack.enter_context(watch.explaining(functools.partial(_finishing, still)))
         stack.enter_context(contextlib.closing(parts))
-        bar = stack.enter_context(_Bar(still, options.quiet))
-        state, number = still.accumulate(state, parts, bar, saver)
+        display = stack.enter_context(_Display(still, options.quiet))
+        state, number = still.accumulate(state, parts, display, saver)
     if not state.sums.count:
         raise Stopped("interrupted before the first pass, nothing was written.", number or 0)
 
@@ -549,12 +554,14 @@ def _render_still(
             ) from None
         except Exception as error:
             raise click.ClickException(f"{tidy(str(cause_of(error)))} {there}") from error
+    if not number:
+        note(_ending(state, options.denoise))
     for path in written:
         options.tell(path)
     if number:
         there = f'the same command with --resume goes on from "{sums_path}"'
         raise Stopped(
-            f"interrupted at {state.sums.count * still.passes.spp} samples per pixel; "
+            f"interrupted at {_how_far(state, options.denoise)}; "
             f"{there if kept else 'the samples could not be saved'}.",
             number,
         )
@@ -589,6 +596,7 @@ def _render_in_one_go(
         "spp": spp,
         "seed": job.seed,
         "sensor": job.sensor,
+        "noise": "not estimated: rendered in one go",
         "renderTime": time.perf_counter() - start,
         "variant": mi.variant(),
         "software": software(stills.versions()),
@@ -596,6 +604,7 @@ def _render_in_one_go(
     channels = [field.name for field in film.bitmap().struct_()]
     picture = stills.Picture(channels, image, {}, stills.component_format(film))
     paths.output(options, ()).write(picture, metadata)
+    options.note(f"{spp} samples per pixel, noise {metadata['noise']}.")
     for path in paths.pictures:
         options.tell(path)
 
@@ -612,43 +621,113 @@ def _farewell(sums_path: Path) -> str:
     return f"interrupted, no picture was written{there if sums_path.exists() else ''}."
 
 
-class _Bar:
-    """A progress bar on stderr, if that is a terminal: called with each ``stills.Progress``."""
+def _how_far(state: checkpoint.Checkpoint, denoised: bool) -> str:
+    """Samples and noise of a still, in words."""
+    count = state.sums.count
+    noise = name_noise(state.noise, count) + (" before denoising" if denoised else "")
+    return f"{count * state.settings['pass_spp']} samples per pixel, noise {noise}"
+
+
+def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
+    """What is said of a still that is done."""
+    spp = state.settings["pass_spp"]
+    advice = ""
+    if state.sums.count == 1 == state.about.get("count", 1) and spp > 1:  # the whole picture
+        advice = f" (--pass-spp {math.ceil(spp / stills.NOISE_PASSES)} has it estimated)"
+    return f"{_how_far(state, denoised)}{advice}."
+
+
+class _Display:
+    """Tells on stderr how far a still is: a bar on a terminal, elsewhere a line now and then.
+
+    Called with each ``stills.Progress``; passes may take minutes, and a thread tells the time
+    meanwhile.
+    """
 
     FORM = "{percentage:3.0f}% |{bar}| {postfix}"
+    BAR_SECONDS, LINE_SECONDS = 1.0, 10.0
 
     def __init__(self, still: stills.Still, quiet: bool):
         from tqdm import tqdm
 
+        self.still, self.quiet = still, quiet
         self.pixels = float(dr.prod(still.film.crop_size()))
-        self.bar = tqdm(total=1.0, bar_format=self.FORM, disable=quiet or None, leave=False)
+        self.bar = tqdm(
+            total=1.0,
+            bar_format=self.FORM,
+            disable=quiet or None,  # None: where no terminal is
+            leave=False,
+            dynamic_ncols=True,
+        )
+        self.latest: tuple[stills.Progress, float] | None = None  # and when it came
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self):
+        if not self.quiet:
+            self.thread.start()
         return self
 
     def __exit__(self, *_):
+        self.done.set()
+        if not self.quiet:
+            self.thread.join()
         self.bar.close()
 
     def __call__(self, progress: stills.Progress) -> None:
-        if self.bar.disable:
-            return
+        self.latest = progress, time.perf_counter()
+        if not self.bar.disable:
+            self._show()
+
+    def _run(self) -> None:
+        while not self.done.wait(self.LINE_SECONDS if self.bar.disable else self.BAR_SECONDS):
+            if self.latest is not None:
+                self._show()
+
+    def _show(self) -> None:
+        progress, then = self.latest
+        since = time.perf_counter() - then
+        left = self._left(progress, since)
+        seconds = progress.seconds + since
+        text = self._words(progress, seconds, left)
+        with contextlib.suppress(OSError):  # a terminal that is gone ends no render
+            if self.bar.disable:
+                _note(text)
+            else:
+                whole = seconds + left if left is not None else 0
+                self.bar.n = min(1.0, seconds / whole) if whole else 0.0
+                self.bar.set_postfix_str(text, refresh=True)
+
+    def _left(self, progress: stills.Progress, since: float) -> float | None:
+        """Seconds that are left, so long after the passes that are done."""
+        passes = self.still.passes
+        if not progress.samples and 0 < passes.done < passes.samples:  # the first is in work
+            part = passes.spp * passes.done / passes.samples
+            return replace(progress, samples=part, seconds=progress.seconds + since).left
         left = progress.left
-        spp = progress.rules.spp
-        words = [f"{progress.samples}{f'/{spp}' if spp else ''} samples per pixel"]
-        if progress.samples:
-            words.append(f"{progress.samples * self.pixels / progress.seconds / 1e6:.2f} M/s")
-        words.append(f"{self._clock(progress.seconds)} elapsed")
-        if left is not None:
-            words.append(f"{self._clock(left)} left")
+        return None if left is None else max(0.0, left - since)
+
+    def _words(self, progress: stills.Progress, seconds: float, left: float | None) -> str:
+        # What matters most comes first: a narrow terminal cuts the rest off
+        count = self.still.count
+        passes, samples = str(progress.passes), str(progress.samples)
+        if count is not None:
+            passes, samples = f"{passes}/{count}", f"{samples}/{count * self.still.passes.spp}"
+        words = [f"{samples} samples per pixel"]
         if progress.noise is not None:
             words.append(f"noise {progress.noise:.2g}")
-        whole = progress.seconds + left if left is not None else 0
-        self.bar.n = min(1.0, progress.seconds / whole) if whole else 0.0
-        with contextlib.suppress(OSError):  # a terminal that is gone ends no render
-            self.bar.set_postfix_str(", ".join(words), refresh=True)
+        if left is not None:
+            words.append(f"{self._clock(left)} left")
+        words.append(f"{self._clock(seconds)} elapsed")
+        words.append(f"{passes} passes")
+        if progress.samples and progress.seconds:
+            rate = progress.samples * self.pixels / progress.seconds
+            words.append(f"{rate / 1e6:.2f} M/s")
+        return ", ".join(words)
 
     def _clock(self, seconds: float) -> str:
-        return self.bar.format_interval(seconds) if seconds < math.inf else "?"
+        # Beyond thirty years no one waits, and the estimate means nothing
+        return self.bar.format_interval(seconds) if seconds < 1e9 else "?"
 
 
 # ----------------------------------------------------------------------- output

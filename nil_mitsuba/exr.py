@@ -65,6 +65,7 @@ FIRST = (
     "spp",
     "seed",
     "passes",
+    "noise",
     "renderTime",
     "capDate",
     "utcOffset",
@@ -237,6 +238,7 @@ def _describe(header: dict[str, exr_header.Attribute]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines += [""] + ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
+    header = _with_noise(header)
     names = sorted(header.keys() - STRUCTURE)
     names.sort(key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
     width = max(map(len, names), default=0)
@@ -245,6 +247,17 @@ def _describe(header: dict[str, exr_header.Attribute]) -> str:
     for name in names:
         lines.append(f"  {name:{width}}  " + _text(header[name]).replace("\n", margin))
     return "\n".join(lines)
+
+
+def _with_noise(header: dict[str, exr_header.Attribute]) -> dict[str, exr_header.Attribute]:
+    """The header, in which the noise of a picture of ours is put into words."""
+    ours = _text(header["software"]).startswith("nil_mitsuba") if "software" in header else False
+    if not ours:
+        return header
+    words = _text(header["noise"]) if "noise" in header else "not stated"
+    if any(name.startswith("noisy.") for name in header["channels"].value):
+        words += " (before denoising)"
+    return header | {"noise": exr_header.Attribute("string", words)}
 
 
 def _size(header: dict[str, exr_header.Attribute]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from . import exr, png
 from .checkpoint import Checkpoint
 from .layers import GUIDES
 from .stills import Picture
-from .sums import name_passes
+from .sums import name_noise, name_passes
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,9 @@ def metadata_of(state: Checkpoint) -> dict:
     integrator = dict(settings["integrator"])
     integrator["cell_origin"] = ",".join(f"{c:.9g}" for c in integrator["cell_origin"])
     about = {key: value for key, value in state.about.items() if key != "count"}
+    noise: float | str = name_noise(state.noise, state.sums.count)
+    if state.noise is not None and math.isfinite(state.noise):
+        noise = float(f"{state.noise:.3g}")  # what it is good for, and what "info" then prints
     return {
         **about,
         "sceneHash": settings["scene"],
@@ -67,6 +71,7 @@ def metadata_of(state: Checkpoint) -> dict:
         "seed": settings["seed"],
         "spp": state.sums.count * settings["pass_spp"],
         "passes": f"{name_passes(passes)} of {settings['pass_spp']} samples per pixel",
+        "noise": noise,
         "layers": ",".join(settings["layers"]),
         "renderTime": state.seconds,
         "variant": settings["variant"],

@@ -27,7 +27,7 @@ import mitsuba as mi
 from . import __version__, checkpoint, parameters
 from .checkpoint import Checkpoint
 from .layers import LAYERS, channel_names
-from .sums import Sums, develop, luminance
+from .sums import Sums, develop, luminance, name_noise
 
 # A checkpoint is never older than this, as long as no single pass and no writing takes longer.
 CHECKPOINT_SECONDS = 60.0
@@ -221,6 +221,7 @@ class Still:
         """
         parts = iter(parts)
         before, start = state.seconds, time.perf_counter()
+        state.noise = noise(self.film, state.sums)
         with interruption() as signals:
             while True:
                 state.seconds = before + time.perf_counter() - start
@@ -228,7 +229,7 @@ class Still:
                     state.sums.count,
                     state.sums.count * self.passes.spp,
                     state.seconds,
-                    noise(self.film, state.sums),
+                    state.noise,
                     self.rules,
                 )
                 try:
@@ -245,6 +246,7 @@ class Still:
                 if part is None:
                     break
                 state = state.plus(part)
+                state.noise = noise(self.film, state.sums)
                 state.seconds = before + time.perf_counter() - start  # As on a clock on the wall
                 if saver is not None:
                     saver.after_pass(state)
@@ -335,18 +337,24 @@ def render(
     image = still.develop(state)
     dr.eval(image)
     if signal_number is not None:
-        raise Interrupted(image, "interrupted; the exception's image is what there is.")
+        raise Interrupted(
+            image,
+            f"interrupted at {state.sums.count * still.passes.spp} samples per pixel, noise "
+            f"{name_noise(state.noise, state.sums.count)}; the exception's image is what there is.",
+        )
     return image
 
 
 def noise(film: mi.Film, sums: Sums) -> float | None:
-    """Estimated relative error of an image, from what its passes differ by; None below two passes.
+    """Root mean square, over all pixels, of the standard error of a pixel's luminance as a fraction
+    of that luminance or of the image's mean luminance, whichever is larger: a number without a
+    unit, 0.02 being two percent; None below two passes.
 
-    It is the root mean square, over all pixels, of the standard error of a pixel's luminance,
-    divided by that luminance or by the mean luminance of the image, whichever is larger. A single
-    pixel counts 1 at most, so that a few bright specks do not hide how far the rest is. Pixels
-    that are infinite or not a number, which no further samples mend, are left out; the error of an
-    image that has no others is infinite.
+    It is estimated from what the passes differ by, and is that of the image as rendered: denoised,
+    an image has another error, of which this says nothing. A single pixel counts 1 at most, so
+    that a few bright specks do not hide how far the rest is. Pixels that are infinite or not a
+    number, which no further samples mend, are left out; the error of an image that has no others
+    is infinite, and that of a black one, in which no sample has found light, 0.
 
     A pixel's luminance is the ratio R = ΣS/ΣW of sums over n passes; the variance of such a ratio
     is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13).
@@ -360,11 +368,12 @@ def noise(film: mi.Film, sums: Sums) -> float | None:
     n = dr.opaque(mi.Float64, sums.count)
     finite = dr.isfinite(total) & dr.isfinite(ss) & dr.isfinite(weight)
     seen = (weight > 0) & finite
-    ratio = dr.select(seen, dr.abs(total / weight), 0)
+    ratio = dr.select(seen, total / weight, 0)
+    size = dr.abs(ratio)  # filters with negative lobes make pixels below black
     count = dr.maximum(dr.count(finite), 1)
     residuals = dr.fma(-2 * ratio, sw, ss) + dr.square(ratio) * ww
     variance = dr.maximum(residuals, 0) / dr.square(weight) * n / (n - 1)
-    scale = dr.maximum(ratio, dr.sum(ratio) / count)
+    scale = dr.maximum(size, dr.sum(size) / count)
     squares = dr.select(seen & (scale > 0), variance / dr.square(scale), 0)
     result = dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
     return result if sums.count > 1 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -66,6 +67,17 @@ def joined(*ranges: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
 def name_passes(ranges: Iterable[tuple[int, int]]) -> str:
     """Ranges of passes as they are written on a command line, such as "0:8, 12:16"."""
     return ", ".join(f"{first}:{stop}" for first, stop in ranges)
+
+
+def name_noise(noise: float | None, passes: int) -> str:
+    """What ``stills.noise`` says of so many passes, or why it says nothing."""
+    if passes < 2:
+        return f"not estimated: {'one pass' if passes else 'no passes'}"
+    if noise is None:
+        return "not stated"
+    if noise == 0:  # A black picture, too, of which one can say no more
+        return "0: all passes are equal"
+    return "infinite: no pixel is finite" if noise == math.inf else f"{noise:.3g}"
 
 
 def develop(film: mi.Film, layers: Iterable[str], sums: Sums, pass_spp: int) -> mi.TensorXf:
