@@ -624,7 +624,9 @@ def _farewell(sums_path: Path) -> str:
 def _how_far(state: checkpoint.Checkpoint, denoised: bool) -> str:
     """Samples and noise of a still, in words."""
     count = state.sums.count
-    noise = name_noise(state.noise, count) + (" before denoising" if denoised else "")
+    noise = name_noise(state.noise, count)
+    if denoised and state.noise is not None:
+        noise += " before denoising"
     return f"{count * state.settings['pass_spp']} samples per pixel, noise {noise}"
 
 
@@ -633,7 +635,7 @@ def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
     spp = state.settings["pass_spp"]
     advice = ""
     if state.sums.count == 1 == state.about.get("count", 1) and spp > 1:  # the whole picture
-        advice = f" (--pass-spp {math.ceil(spp / stills.NOISE_PASSES)} has it estimated)"
+        advice = f" (--pass-spp {math.ceil(spp / stills.NOISE_PASSES)} makes more)"
     return f"{_how_far(state, denoised)}{advice}."
 
 
@@ -644,7 +646,7 @@ class _Display:
     meanwhile.
     """
 
-    FORM = "{percentage:3.0f}% |{bar}| {postfix}"
+    FORM = "{percentage:3.0f}% |{bar}| {desc}"  # tqdm puts a comma before "postfix"
     BAR_SECONDS, LINE_SECONDS = 1.0, 10.0
 
     def __init__(self, still: stills.Still, quiet: bool):
@@ -677,15 +679,14 @@ class _Display:
     def __call__(self, progress: stills.Progress) -> None:
         self.latest = progress, time.perf_counter()
         if not self.bar.disable:
-            self._show()
+            self._show(*self.latest)
 
     def _run(self) -> None:
         while not self.done.wait(self.LINE_SECONDS if self.bar.disable else self.BAR_SECONDS):
             if self.latest is not None:
-                self._show()
+                self._show(*self.latest)
 
-    def _show(self) -> None:
-        progress, then = self.latest
+    def _show(self, progress: stills.Progress, then: float) -> None:
         since = time.perf_counter() - then
         left = self._left(progress, since)
         seconds = progress.seconds + since
@@ -696,7 +697,7 @@ class _Display:
             else:
                 whole = seconds + left if left is not None else 0
                 self.bar.n = min(1.0, seconds / whole) if whole else 0.0
-                self.bar.set_postfix_str(text, refresh=True)
+                self.bar.set_description_str(text, refresh=True)
 
     def _left(self, progress: stills.Progress, since: float) -> float | None:
         """Seconds that are left, so long after the passes that are done."""

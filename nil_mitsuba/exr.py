@@ -254,8 +254,11 @@ def _with_noise(header: dict[str, exr_header.Attribute]) -> dict[str, exr_header
     ours = _text(header["software"]).startswith("nil_mitsuba") if "software" in header else False
     if not ours:
         return header
-    words = _text(header["noise"]) if "noise" in header else "not stated"
-    if any(name.startswith("noisy.") for name in header["channels"].value):
+    noise = header.get("noise", exr_header.Attribute("string", "not stated"))  # by 0.1.0
+    words = _text(noise)
+    if noise.type != "string" and any(
+        name.startswith("noisy.") for name in header["channels"].value
+    ):
         words += " (before denoising)"
     return header | {"noise": exr_header.Attribute("string", words)}
 

@@ -84,6 +84,11 @@ def assert_close(rows, others):
         assert row == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
+def remarks(err):
+    """What was said, without the line on samples and noise that ends a still."""
+    return re.sub(r"^\d+ samples per pixel, noise .*\.\n", "", err, flags=re.M)
+
+
 def complaint(err):
     """The one line of complaint; what was said before it is a note on the integrator."""
     lines = err.splitlines()

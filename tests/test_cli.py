@@ -38,10 +38,6 @@ def test_threads_and_other_variants(command, folder):
     assert read("scene.exr")[0]["variant"] == "llvm_ad_spectral"
 
 
-def test_no_progress_bar_where_no_one_watches(command):
-    assert command("render", "scene.xml")[2] == ""
-
-
 def test_help_and_version_are_no_errors(command):
     status, out, _ = command("render", "--help")
     assert status == 0 and "--fit" in out
@@ -67,22 +63,6 @@ def test_a_still_is_rendered_for_a_time_or_down_to_a_noise(command, monkeypatch)
 )
 def test_times_are_read(text, seconds):
     assert cli.Duration().convert(text, None, None) == seconds
-
-
-def test_a_bar_tells_samples_rate_time_and_noise_on_a_terminal(command, monkeypatch):
-    import io
-
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 4)
-    command("render", "scene.xml", "--noise", "1e-9", "--spp", "16")
-    bar = terminal.getvalue()
-    for fragment in ("16/16 samples per pixel", "M/s", "elapsed", "left", "noise 0."):
-        assert fragment in bar
-    terminal.truncate(0)
-    command("render", "scene.xml", "--quiet")
-    assert terminal.getvalue().strip("\0") == ""
 
 
 BAD_MESH = '<shape type="obj"><string name="filename" value="missing.obj"/></shape>'
@@ -273,7 +253,7 @@ def test_names_that_cannot_be_written_are_refused_before_rendering(
 
 
 def test_a_tiny_noise_and_a_tiny_time_are_rules_as_others(command, monkeypatch):
-    monkeypatch.setattr(cli._Bar, "FORM", "{postfix}")
+    monkeypatch.setattr(cli._Display, "FORM", "{desc}")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     status, _, err = command("render", "scene.xml", "--noise", "1e-200", "--spp", "8")
     assert status == 0, err

@@ -2,7 +2,7 @@
 
 import pytest
 
-from command_line import LAMP, NIL, SENSOR, complaint, planes, read, scene
+from command_line import LAMP, NIL, SENSOR, complaint, planes, read, remarks, scene
 from nil_mitsuba import stills
 
 
@@ -27,7 +27,7 @@ def test_a_checkpoint_that_is_named_stays_and_more_samples_go_on_with_it(command
 def test_without_a_checkpoint_resuming_begins_anew_and_says_so(command, folder):
     status, out, err = command("render", "scene.xml", "--resume")
     assert (status, out) == (0, "scene.exr\n")
-    assert err == 'there is no checkpoint "scene.sums": beginning with the first pass.\n'
+    assert remarks(err) == 'there is no checkpoint "scene.sums": beginning with the first pass.\n'
     assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.xml"]
 
 
@@ -45,17 +45,17 @@ def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
     parts = ["scene.0-1.sums", "scene.2-4.sums"]
     status, out, err = command("merge", *parts, "-o", "merged.exr")
     assert (status, out) == (0, "merged.exr\n")
-    assert err == "the passes 1:2 of 0:4 are missing.\n"
+    assert remarks(err) == "the passes 1:2 of 0:4 are missing.\n"
     status, out, err = command(
         "merge", *parts, "scene.1-2.sums", "-o", "merged.exr", "--png", "merged.png"
     )
-    assert (status, out, err) == (0, "merged.exr\nmerged.png\n", "")
+    assert (status, out, remarks(err)) == (0, "merged.exr\nmerged.png\n", "")
     merged = planes("merged.exr")
     for name in "RGB":
         for row, expected in zip(merged[name], whole[name]):
             assert row == pytest.approx(expected, rel=1e-6)
     header, sound = read("merged.exr")[0], read("scene.exr")[0]
-    for name in ("spp", "seed", "sceneHash", "integrator", "twist", "passes"):
+    for name in ("spp", "seed", "sceneHash", "integrator", "twist", "passes", "noise"):
         assert header[name] == sound[name]
 
     # In steps, too
@@ -109,7 +109,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_once(command, folder, monke
     monkeypatch.setattr(stills.checkpoint, "save", full)
     status, out, err = command("render", "scene.xml", "--noise", "1e-9", "--spp", "4")
     assert (status, out) == (0, "scene.exr\n")
-    assert len(err.splitlines()) == 1 and "No space left on device" in err
+    assert len(remarks(err).splitlines()) == 1 and "No space left on device" in err
 
 
 def test_a_part_goes_on_with_other_passes(command, monkeypatch):
