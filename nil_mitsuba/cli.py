@@ -156,7 +156,7 @@ class RenderOptions(PictureOptions):
     def tell(self, path: Path) -> None:
         """Print the name of a file that is written."""
         if not self.quiet:
-            click.echo(path)
+            _tell(path)
 
     @property
     def clustered(self) -> bool:
@@ -375,7 +375,7 @@ def merge(parts, output, **picture):
         out.write(stills.picture_of(state), metadata_of(state))
     _note(_ending(state, options.denoise))
     for path in filter(None, (exr_path, png_path)):
-        click.echo(path)
+        _tell(path)
 
 
 @cli.command()
@@ -398,7 +398,7 @@ def main() -> None:
         with contextlib.suppress(KeyboardInterrupt):
             dr.sync_thread()  # a kernel that is left would keep the process, and no one watch it
     if sentence:
-        click.echo(sentence, err=True)
+        _note(sentence)
     sys.exit(status)
 
 
@@ -555,6 +555,8 @@ def _render_still(
         except Exception as error:
             raise click.ClickException(f"{tidy(str(cause_of(error)))} {there}") from error
     if not number:
+        if not (options.checkpoint or options.passes):
+            sums_path.unlink(missing_ok=True)  # whoever reads what is told may be gone
         note(_ending(state, options.denoise))
     for path in written:
         options.tell(path)
@@ -567,8 +569,6 @@ def _render_still(
         )
     if options.passes and not kept:
         sys.exit(1)  # the saver has said why
-    if not (options.checkpoint or options.passes):
-        sums_path.unlink(missing_ok=True)
 
 
 def _render_in_one_go(
@@ -604,7 +604,7 @@ def _render_in_one_go(
     channels = [field.name for field in film.bitmap().struct_()]
     picture = stills.Picture(channels, image, {}, stills.component_format(film))
     paths.output(options, ()).write(picture, metadata)
-    options.note(f"{spp} samples per pixel, noise {metadata['noise']}.")
+    options.note(f"{_samples(spp)}, noise {metadata['noise']}.")
     for path in paths.pictures:
         options.tell(path)
 
@@ -621,13 +621,17 @@ def _farewell(sums_path: Path) -> str:
     return f"interrupted, no picture was written{there if sums_path.exists() else ''}."
 
 
+def _samples(spp: int) -> str:
+    return f"{spp} sample{'' if spp == 1 else 's'} per pixel"
+
+
 def _how_far(state: checkpoint.Checkpoint, denoised: bool) -> str:
     """Samples and noise of a still, in words."""
     count = state.sums.count
     noise = name_noise(state.noise, count)
     if denoised and state.noise is not None:
         noise += " before denoising"
-    return f"{count * state.settings['pass_spp']} samples per pixel, noise {noise}"
+    return f"{_samples(count * state.settings['pass_spp'])}, noise {noise}"
 
 
 def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
@@ -652,12 +656,13 @@ class _Display:
     def __init__(self, still: stills.Still, quiet: bool):
         from tqdm import tqdm
 
-        self.still, self.quiet = still, quiet
+        self.still = still
+        self.quiet = quiet or sys.stderr is None  # closed from the start
         self.pixels = float(dr.prod(still.film.crop_size()))
         self.bar = tqdm(
             total=1.0,
             bar_format=self.FORM,
-            disable=quiet or None,  # None: where no terminal is
+            disable=self.quiet or None,  # None: where no terminal is
             leave=False,
             dynamic_ncols=True,
         )
@@ -691,13 +696,13 @@ class _Display:
         left = self._left(progress, since)
         seconds = progress.seconds + since
         text = self._words(progress, seconds, left)
-        with contextlib.suppress(OSError):  # a terminal that is gone ends no render
-            if self.bar.disable:
-                _note(text)
-            else:
-                whole = seconds + left if left is not None else 0
-                self.bar.n = min(1.0, seconds / whole) if whole else 0.0
-                self.bar.set_description_str(text, refresh=True)
+        if self.bar.disable:
+            _note(text)
+            return
+        whole = seconds + left if left is not None else 0
+        self.bar.n = min(1.0, seconds / whole) if whole else 0.0
+        with contextlib.suppress(OSError):  # as in _note
+            self.bar.set_description_str(text, refresh=True)
 
     def _left(self, progress: stills.Progress, since: float) -> float | None:
         """Seconds that are left, so long after the passes that are done."""
@@ -803,8 +808,20 @@ def _output_path(name: str | Path, suffix: str, option: str) -> Path:
     return path
 
 
+def _tell(path: Path) -> None:
+    try:
+        click.echo(path)
+    except BrokenPipeError:
+        raise  # click ends quietly
+    except OSError as error:
+        raise click.ClickException(
+            f'"{path}" is written, but its name cannot be printed: {error.strerror}.'
+        ) from None
+
+
 def _note(sentence: str) -> None:
-    click.echo(sentence, err=True)
+    with contextlib.suppress(OSError):  # a terminal or a pipe that is gone ends no render
+        click.echo(sentence, err=True)
 
 
 # ---------------------------------------------------------------------- Mitsuba

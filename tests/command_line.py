@@ -86,7 +86,7 @@ def assert_close(rows, others):
 
 def remarks(err):
     """What was said, without the line on samples and noise that ends a still."""
-    return re.sub(r"^\d+ samples per pixel, noise .*\.\n", "", err, flags=re.M)
+    return re.sub(r"^\d+ samples? per pixel, noise .*\.\n", "", err, flags=re.M)
 
 
 def complaint(err):

@@ -1,5 +1,6 @@
 """What is told of a still's noise and progress: in its files, at the end, and meanwhile."""
 
+import errno
 import hashlib
 import io
 import os
@@ -69,7 +70,7 @@ def test_one_pass_has_no_noise_and_says_how_to_have_it(command):
     )
     assert stated() == told(command) == "not estimated: one pass"
     _, _, err = command("render", "scene.xml", "--spp", "1")
-    assert err == "1 samples per pixel, noise not estimated: one pass.\n"
+    assert err == "1 sample per pixel, noise not estimated: one pass.\n"
 
 
 def test_what_is_rendered_in_one_go_says_that_there_is_no_estimate(command, folder):
@@ -231,11 +232,26 @@ def test_a_narrow_terminal_shows_samples_and_noise(command, monkeypatch):
     assert any("16/16 samples per pixel, noise 0." in bar for bar in bars)
 
 
-def test_a_stream_that_is_gone_ends_no_render(command, slow, monkeypatch):
-    def gone(_):
-        raise BrokenPipeError
+@pytest.mark.parametrize(
+    "stream, number, status",
+    [
+        ("stdout", errno.EPIPE, 1),  # no one learns where the picture is
+        ("stdout", errno.ENOSPC, 1),
+        ("stderr", errno.EPIPE, 0),
+        ("stderr", None, 0),  # closed from the start
+    ],
+)
+def test_a_reader_that_is_gone_loses_no_picture(
+    command, folder, slow, monkeypatch, stream, number, status
+):
+    class Gone(io.StringIO):
+        def write(self, _):
+            raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli, "_note", gone)
-        command(*FOUR_PASSES)
+        patch.setattr(sys, stream, Gone() if number else None)
+        found, _, err = command(*FOUR_PASSES)
+    assert found == status
+    assert number != errno.ENOSPC or '"scene.exr" is written, but' in err
     assert exr_header.read("scene.exr")[0]["spp"].value == 16
+    assert sorted(path.name for path in folder.iterdir()) == ["scene.exr", "scene.xml"]
