@@ -719,13 +719,13 @@ class _Display:
         passes, samples = str(progress.passes), str(progress.samples)
         if count is not None:
             passes, samples = f"{passes}/{count}", f"{samples}/{count * self.still.passes.spp}"
-        words = [f"{samples} samples per pixel"]
+        words = [f"{samples} spp"]
         if progress.noise is not None:
             words.append(f"noise {progress.noise:.2g}")
         if left is not None:
             words.append(f"{self._clock(left)} left")
         words.append(f"{self._clock(seconds)} elapsed")
-        words.append(f"{passes} passes")
+        words.append("1 pass" if passes == "1" else f"{passes} passes")
         if progress.samples and progress.seconds:
             rate = progress.samples * self.pixels / progress.seconds
             words.append(f"{rate / 1e6:.2f} M/s")

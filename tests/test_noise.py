@@ -180,7 +180,7 @@ def test_a_pipe_gets_a_line_now_and_then(command, slow):
     assert end.startswith("12 samples per pixel, noise 0.")
     assert len(lines) > 4  # within passes, too
     form = (
-        r"(\d+)/12 samples per pixel, (noise 0\.\d+, )?(\d+:\d+ left, )?\d+:\d+ elapsed, "
+        r"(\d+)/12 spp, (noise 0\.\d+, )?(\d+:\d+ left, )?\d+:\d+ elapsed, "
         r"(\d)/3 passes(, [\d.]+ M/s)?"
     )
     matches = [re.fullmatch(form, line) for line in lines]
@@ -195,7 +195,7 @@ def test_a_pipe_gets_a_line_now_and_then(command, slow):
 def test_without_a_number_of_samples_a_line_tells_what_is_done(command, slow, monkeypatch):
     monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 4)
     err = command("render", "scene.xml", "--time", "0.5s")[2]
-    assert re.search(r"^8 samples per pixel, noise [\d.]+, 00:00 left, .*, 2 passes, ", err, re.M)
+    assert re.search(r"^8 spp, noise [\d.]+, 00:00 left, .*, 2 passes, ", err, re.M)
 
 
 def test_quiet_means_no_line_and_no_bar(command, slow, monkeypatch):
@@ -211,7 +211,7 @@ def test_a_terminal_gets_a_bar_with_the_noise_from_the_second_pass_on(command, s
     command(*FOUR_PASSES)
     *bars, end = re.split(r"[\r\n]+", terminal.getvalue().strip())
     assert end.startswith("16 samples per pixel, noise 0.")
-    for fragment in ("16/16 samples per pixel", "M/s", "elapsed", "left", "noise 0."):
+    for fragment in ("16/16 spp", "M/s", "elapsed", "left", "noise 0."):
         assert fragment in " ".join(bars)
     for bar in filter(None, map(str.strip, bars)):
         passes = re.search(r"(\d)/4 passes", bar)
@@ -221,15 +221,15 @@ def test_a_terminal_gets_a_bar_with_the_noise_from_the_second_pass_on(command, s
 def test_a_narrow_terminal_shows_samples_and_noise(command, monkeypatch):
     fcntl, termios = pytest.importorskip("fcntl"), pytest.importorskip("termios")
     main, terminal = os.openpty()
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("4H", 24, 60, 0, 0))
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("4H", 24, 40, 0, 0))
     with open(terminal, "w") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
         command(*FOUR_PASSES)
         text = os.read(main, 10000).decode()  # less than a terminal holds until it is read
     os.close(main)
     bars = [bar for bar in text.split("\r") if "%" in bar]
-    assert bars and max(map(len, bars)) <= 60
-    assert any("16/16 samples per pixel, noise 0." in bar for bar in bars)
+    assert bars and max(map(len, bars)) <= 40
+    assert any("16/16 spp, noise 0." in bar for bar in bars)
 
 
 @pytest.mark.parametrize(
