@@ -148,16 +148,16 @@ def test_an_interrupted_render_call_tells_its_noise(small):
 
 @pytest.fixture
 def slow(monkeypatch):
-    """Passes take a tenth of a second more, and a line is due several times in each."""
+    """Passes take a twentieth of a second more, and a line is due several times in each."""
     render = stills.Still.render
 
     def wait(self, index):
-        time.sleep(0.1)
+        time.sleep(0.05)
         return render(self, index)
 
     monkeypatch.setattr(stills.Still, "render", wait)
-    monkeypatch.setattr(cli._Display, "LINE_SECONDS", 0.03)
-    monkeypatch.setattr(cli._Display, "BAR_SECONDS", 0.03)
+    monkeypatch.setattr(cli._Display, "LINE_SECONDS", 0.01)
+    monkeypatch.setattr(cli._Display, "BAR_SECONDS", 0.01)
 
 
 def as_terminal(monkeypatch):
@@ -194,7 +194,7 @@ def test_a_pipe_gets_a_line_now_and_then(command, slow):
 
 def test_without_a_number_of_samples_a_line_tells_what_is_done(command, slow, monkeypatch):
     monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 4)
-    err = command("render", "scene.xml", "--time", "0.5s")[2]
+    err = command("render", "scene.xml", "--noise", "0.5")[2]  # four passes
     assert re.search(r"^8 spp, noise [\d.]+, 00:00 left, .*, 2 passes, ", err, re.M)
 
 
@@ -242,16 +242,17 @@ def test_a_narrow_terminal_shows_samples_and_noise(command, monkeypatch):
     ],
 )
 def test_a_reader_that_is_gone_loses_no_picture(
-    command, folder, slow, monkeypatch, stream, number, status
+    command, folder, monkeypatch, stream, number, status
 ):
     class Gone(io.StringIO):
         def write(self, _):
             raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
+        patch.setattr(cli._Display, "LINE_SECONDS", 0.001)
         patch.setattr(sys, stream, Gone() if number else None)
-        found, _, err = command(*FOUR_PASSES)
+        found, _, err = command("render", "scene.xml", "--spp", "8", "--pass-spp", "4")
     assert found == status
     assert number != errno.ENOSPC or '"scene.exr" is written, but' in err
-    assert exr_header.read("scene.exr")[0]["spp"].value == 16
+    assert exr_header.read("scene.exr")[0]["spp"].value == 8
     assert sorted(path.name for path in folder.iterdir()) == ["scene.exr", "scene.xml"]
