@@ -2,7 +2,8 @@
 
 From x = 1/4 straight ahead along y, four cells lead back to the start, one storey higher: by
 (x, y, z + k x y) the walk is closed at twist 1, and so the film is a loop. With ffmpeg:
-``ffmpeg -i frames/%03d.png walk.mp4``.
+``ffmpeg -i frames/%03d.png walk.mp4``. Where the fibres run along another axis of the scene than
+z, the walk's x, y and z are the cell's: z along the fibres.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def main():
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--start", type=point, default=[0.25, 0, 0.655], help="x,y,z in cells")
-    parser.add_argument("--direction", type=point, default=[0, 1, 0], help="in frame components")
+    parser.add_argument("--direction", type=point, default=[0, 1, 0], help="frame components")
     parser.add_argument("--length", type=float, default=4, help="in cells")
     parser.add_argument("--twist", type=int, default=1)
     parser.add_argument("--size", type=int, default=320, help="width of a frame in pixels")
@@ -53,14 +54,20 @@ def main():
     integrator = scene.integrator()
     origin, cell = mi.Point3f(integrator.cell_origin), integrator.cell_size
     start, direction = mi.Point3f(options.start), dr.normalize(mi.Vector3f(options.direction))
+    first = "xyz".index(integrator.fibres) + 1  # the scene's axis that is the cell's x, modulo 3
+
+    def in_scene(v):
+        return type(v)(*(v[(axis - first) % 3] for axis in range(3)))
 
     frames = []
     for i in range(options.frames):
         t = mi.Float(options.length * i / options.frames)
         p, v = geometry.flow(start, direction, t, integrator.twist)
         # A camera's rotation is read in frame components: E3 stays upright, whatever the place.
-        eye = origin + cell * p
-        camera["to_world"] = mi.Transform4f().look_at(eye, eye + v, mi.Vector3f(0, 0, 1))
+        eye = origin + cell * in_scene(p)
+        camera["to_world"] = mi.Transform4f().look_at(
+            eye, eye + in_scene(v), in_scene(mi.Vector3f(0, 0, 1))
+        )
         camera.update()
         frames.append(mi.render(scene, seed=i))
         if options.frames_to:

@@ -87,13 +87,17 @@ class Camera:
         else:
             cone = Cone(0, self.tolerance * 1e-3)  # a single ray: as in an image 1,000 pixels wide
 
-        p, v = space.to_cells(origin), mi.Vector3f(ray.d)
+        p, v = space.to_cells(origin), space.to_cell_axes(mi.Vector3f(ray.d))
         if self.thinlens:
             p, v = self._through_lens(p, on_plane, ray)
         else:
-            p = geometry.multiply(p, mi.Point3f(on_plane * space.cells_per_unit), space.twist)
+            p = geometry.multiply(p, self._step(on_plane), space.twist)
         p, v = geometry.flow(p, v, near, space.twist)
-        return p, v, cone, far
+        return p, space.to_scene_axes(v), cone, far
+
+    def _step(self, v):
+        """A vector (scene) as what a point (cells) is multiplied by."""
+        return self.space.to_cell_axes(mi.Point3f(v * self.space.cells_per_unit))
 
     def _view(self, ray, across):
         """Origin of the sensor that a ray is from, and the way to its near clip plane (scene)."""
@@ -105,14 +109,14 @@ class Camera:
         return origin, near
 
     def _through_lens(self, pinhole, on_lens, ray):
-        """The ray from a point of the lens to where the pinhole's geodesic is in focus."""
+        """Start (cells) of the ray from a point of the lens to where the pinhole's geodesic is in
+        focus, and its direction in cell axes."""
         space, k = self.space, self.space.twist
         to_focus = on_lens + self.focus_distance / self.views[0].depth(ray) * ray.d
         length = dr.norm(to_focus)
-        focus, _ = geometry.flow(
-            pinhole, mi.Vector3f(to_focus / length), length * space.cells_per_unit, k
-        )
-        lens = geometry.multiply(pinhole, mi.Point3f(on_lens * space.cells_per_unit), k)
+        towards = space.to_cell_axes(mi.Vector3f(to_focus / length))
+        focus, _ = geometry.flow(pinhole, towards, length * space.cells_per_unit, k)
+        lens = geometry.multiply(pinhole, self._step(on_lens), k)
         return lens, mi.Vector3f(geometry.connect(lens, focus, k).direction)
 
 

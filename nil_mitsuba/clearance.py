@@ -69,7 +69,7 @@ class Clearance:
             self.grid = _Grid(space, pieces, mi.Point3f(0), [1 / n] * 3, (n, n, n))
             self.table = opaque(dr.maximum(self.grid.least - self.slack, 0))
         else:
-            extents = [float(x) / size for x in box.extents()]
+            extents = [float(x) / size for x in space.to_cell_axes(box.extents())]
             counts = _counts(extents, voxels**3 if voxels else PLAIN_VOXELS)
             # A flat box has one layer of voxels without a height
             edges = [x / n for x, n in zip(extents, counts)]

@@ -37,10 +37,11 @@ class NilIntegrator(ADIntegrator):
     """Path tracer whose rays are geodesics of Nil, in plain Nil or in the quotient by Γ.
 
     Parameters: ``max_depth`` (−1), ``rr_depth`` (5) and ``hide_emitters`` (false) as in ``path``;
-    ``twist`` (1); ``quotient`` (true); ``cell_origin`` (0, 0, 0) and ``cell_size`` (1), in scene
-    units; ``tolerance`` (0.25), in pixels; ``max_distance`` of one segment, in cells (12 in the
-    quotient, unlimited in plain Nil); ``aovs``, layers to render beside the picture (none of them;
-    a list such as "distance, normal"). It offers no gradients and no participating media.
+    ``twist`` (1); ``quotient`` (true); ``fibres`` ("z"), the scene's axis along which they run;
+    ``cell_origin`` (0, 0, 0) and ``cell_size`` (1), in scene units; ``tolerance`` (0.25), in
+    pixels; ``max_distance`` of one segment, in cells (12 in the quotient, unlimited in plain Nil);
+    ``aovs``, layers to render beside the picture (none of them; a list such as "distance, normal").
+    It offers no gradients and no participating media.
     """
 
     _given: dict = {}  # Parameters that are not left to their defaults
@@ -65,6 +66,7 @@ class NilIntegrator(ADIntegrator):
     def to_string(self) -> str:
         return (
             f"NilIntegrator[\n  twist = {self.twist:g},\n  quotient = {self.quotient},\n"
+            f"  fibres = {self.fibres},\n"
             f"  cell_origin = {list(self.cell_origin)},\n  cell_size = {self.cell_size:g},\n"
             f"  tolerance = {self.tolerance:g},\n  max_distance = {self.max_distance:g},\n"
             f"  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
@@ -377,6 +379,7 @@ class View:
             list(integrator.cell_origin),
             integrator.cell_size,
             general,
+            integrator.fibres,
         )
         self.shapes = Shapes(scene)
         focus = None

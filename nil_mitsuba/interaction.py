@@ -20,8 +20,15 @@ def unit_conormal(p: mi.Point3f, n: mi.Normal3f, space: Space) -> mi.Normal3f:
 
     A normal is a covector: (nx, ny + k x nz, nz), normalised. A zero normal stays zero.
     """
-    conormal = mi.Normal3f(geometry.conormal(p, n, space.twist))
+    conormal = geometry.conormal(p, space.to_cell_axes(mi.Normal3f(n)), space.twist)
+    conormal = space.to_scene_axes(conormal)
     return conormal * dr.rsqrt(dr.maximum(dr.squared_norm(conormal), 1e-30))
+
+
+def _to_frame(p, v, space):
+    """Frame components at ``p`` (cells) of a scene's vector ``v``."""
+    v = geometry.to_frame(p, space.to_cell_axes(v), space.twist)
+    return space.to_scene_axes(v)
 
 
 def surface_interaction(
@@ -40,9 +47,8 @@ def surface_interaction(
 
     if not space.flat:
         p = space.to_cells(si.p)
-        k = space.twist
-        si.dp_du = geometry.to_frame(p, si.dp_du, k)
-        si.dp_dv = geometry.to_frame(p, si.dp_dv, k)
+        si.dp_du = _to_frame(p, si.dp_du, space)
+        si.dp_dv = _to_frame(p, si.dp_dv, space)
         si.n = unit_conormal(p, si.n, space)
 
         # As Mitsuba does, but orthogonal in Nil: tangents are vectors, normals covectors
@@ -51,7 +57,7 @@ def surface_interaction(
 
     # A geodesic that only grazes a surface may turn away from it within the tolerance, where the
     # line that was traced goes through: what was hit from one side is seen from that side.
-    line = mi.Vector3f(hit.ray.d) if space.flat else geometry.to_frame(p, hit.ray.d, k)
+    line = mi.Vector3f(hit.ray.d) if space.flat else _to_frame(p, hit.ray.d, space)
     same_side = dr.dot(hit.arrival, si.n) * dr.dot(line, si.n) > 0
     arrival = dr.select(same_side, hit.arrival, dr.normalize(mi.Vector3f(line)))
     incoming = dr.select(hit.valid, arrival, start_direction)
@@ -87,6 +93,6 @@ def offset(
     metric dual of ``n`` would lead through walls that meet this one at a right angle.
     """
     cells = space.to_cells(p)
-    normal = mi.Vector3f(geometry.conormal(cells, n, -space.twist))
+    normal = mi.Vector3f(geometry.conormal(cells, space.to_cell_axes(n), -space.twist))
     normal = dr.mulsign(dr.normalize(normal), dr.dot(n, d))
     return cells + mi.Point3f(normal) * (margin / space.size)

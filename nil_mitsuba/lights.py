@@ -379,8 +379,9 @@ class Lights:
         active = active & self._in_cube(q) & (area > 0)
         image, probability = self._image_of(p, q, u1, u2)
         way = geometry.connect(p, image, space.twist)
-        direction, arrival = mi.Vector3f(way.direction), mi.Vector3f(way.arrival)
-        n = mi.Normal3f(geometry.conormal(q, ps.n, space.twist))
+        direction = space.to_scene_axes(mi.Vector3f(way.direction))
+        arrival = mi.Vector3f(way.arrival)  # cell axes, as the next
+        n = mi.Normal3f(geometry.conormal(q, space.to_cell_axes(ps.n), space.twist))
         stretch = dr.norm(n)
         cosine = -dr.dot(n, arrival) / stretch
 
@@ -436,7 +437,7 @@ class Lights:
         # that they take no digits of the direction.
         L = 8 * (1 + dr.max(dr.abs(light)))
         reference = dr.zeros(mi.Interaction3f)
-        reference.p = dr.fma(-L, mi.Vector3f(way.arrival), light)
+        reference.p = dr.fma(-L, space.to_scene_axes(mi.Vector3f(way.arrival)), light)
         reference.wavelengths, reference.time = si.wavelengths, si.time
         ds, intensity = emitter.sample_direction(reference, mi.Point2f(0.5), active)
         density = dr.abs(way.area_density) * dr.square(space.size)
@@ -444,9 +445,8 @@ class Lights:
         intensity *= dr.square(L)
         weight = dr.select(reached, intensity * dr.rcp(density * probability), 0)
         reach = way.distance * (1 - ARRIVAL_ROUNDING)
-        return LightSample(
-            mi.Vector3f(way.direction), reach, weight, mi.Float(0), mi.Bool(True), mi.Float(0)
-        )
+        direction = space.to_scene_axes(mi.Vector3f(way.direction))
+        return LightSample(direction, reach, weight, mi.Float(0), mi.Bool(True), mi.Float(0))
 
     # ------------------------------------------------------------------ weights
 
@@ -486,8 +486,9 @@ class Lights:
         space = self.space
         lit = active & (emitter != None)  # noqa: E711 - an array of pointers
         q = space.to_cells(si.p)
+        n, arrival = space.to_cell_axes(si.n), space.to_cell_axes(hit.arrival)
         # |N| is lost in the Nil unit normal, which has length 1/|N| as a Euclidean normal.
-        stretch = dr.rcp(dr.norm(geometry.conormal(q, si.n, -space.twist)))
+        stretch = dr.rcp(dr.norm(geometry.conormal(q, n, -space.twist)))
         number = dr.reinterpret_array(mi.UInt32, emitter)
         # Density on the surface per unit of Nil's area
         per_area = dr.gather(mi.Float, self.area_densities, number, lit) / stretch
@@ -508,12 +509,12 @@ class Lights:
         # tangent plane the point in the same direction, which is as far as the start is off the
         # vertex along the light's normal. Where that is far, the light is seen edge on.
         beside = geometry.to_frame(p, mi.Vector3f(start - p), space.twist)
-        ahead = dr.dot(si.n, beside) / dr.dot(si.n, hit.arrival)
+        ahead = dr.dot(n, beside) / dr.dot(n, arrival)
         distance = hit.distance * (1 + dr.clip(ahead / hit.distance, -0.25, 0.25))
-        density = geometry.area_density(distance, hit.arrival.z, space.twist)
+        density = geometry.area_density(distance, arrival.z, space.twist)
         density *= dr.square(space.size)
-        cosine = dr.abs(dr.dot(si.n, hit.arrival))
-        half_turn = 0.5 * dr.abs(space.twist * hit.arrival.z) * hit.distance
+        cosine = dr.abs(dr.dot(n, arrival))
+        half_turn = 0.5 * dr.abs(space.twist * arrival.z) * hit.distance
         pdf = per_area * density / cosine
         if self.images is not None:
             pdf *= self.images.probability(p, q, g)

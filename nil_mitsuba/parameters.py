@@ -17,6 +17,7 @@ from .layers import RENDERED
 NAMES = (
     "twist",
     "quotient",
+    "fibres",
     "cell_origin",
     "cell_size",
     "tolerance",
@@ -55,6 +56,7 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "twist": twist,
         "quotient": quotient,
+        "fibres": _axis(given, "fibres", "z"),
         "cell_origin": _point(given, "cell_origin"),
         "cell_size": _positive(given, "cell_size", 1.0),
         "tolerance": _positive(given, "tolerance", 0.25),
@@ -110,6 +112,13 @@ def _positive(given, name, default):
     value = _number(given, name, default)
     if value <= 0:
         raise RuntimeError(f'"{name}" must be greater than zero, and it is {value:g}')
+    return value
+
+
+def _axis(given, name, default):
+    value = given.get(name, default)
+    if not isinstance(value, str) or value not in ("x", "y", "z"):
+        raise RuntimeError(f'"{name}" must be an axis of the scene, x, y or z, and it is "{value}"')
     return value
 
 

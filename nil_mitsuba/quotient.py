@@ -8,8 +8,12 @@ stays straight when it is carried into the neighbouring cell.
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import drjit as dr
 import mitsuba as mi
+
+Vector = TypeVar("Vector", bound=Any)  # any of Mitsuba's types with three components
 
 
 def opaque(value):
@@ -25,6 +29,10 @@ class Space:
     units) the length of its edge. Numbers that vary between renders are opaque, so that kernels
     are compiled once for all of them. Only the twist 0 is written into them, and what it makes 0
     falls away: such a space is ``flat``. If it is ``general``, kernels do for the twist 0, too.
+
+    ``fibres`` is the scene's axis ("x", "y" or "z") along which the cell's z runs; its x and y are
+    the two that follow in the cycle. Points in cells have cell axes, and so has all of `geometry`.
+    Points in scene units, and frame components wherever Mitsuba sees them, have scene axes.
     """
 
     EDGES = (1.0, 1.0, 1.0)  # A, B and C of the quotient's box, in cells
@@ -36,7 +44,12 @@ class Space:
         origin: list[float],
         size: float,
         general: bool = False,
+        fibres: str = "z",
     ):
+        first = "xyz".index(fibres) + 1
+        # The scene's axis of each of the cell's, and back
+        self._scene_axes = [(first + i) % 3 for i in range(3)]
+        self._cell_axes = [(i - first) % 3 for i in range(3)]
         self.quotient = quotient
         self.flat = twist == 0 and not general
         self.twist_number = twist
@@ -68,11 +81,21 @@ class Space:
 
     def to_cells(self, p: mi.Point3f) -> mi.Point3f:
         """Scene coordinates to cell coordinates."""
-        return mi.Point3f((p - self.origin) * self.cells_per_unit)
+        return self.to_cell_axes(mi.Point3f((p - self.origin) * self.cells_per_unit))
 
     def to_scene(self, p: mi.Point3f) -> mi.Point3f:
         """Cell coordinates to scene coordinates."""
-        return dr.fma(self.size, p, self.origin)
+        return dr.fma(self.size, self.to_scene_axes(p), self.origin)
+
+    # Other names for what is there: kernels do nothing for it
+
+    def to_cell_axes(self, v: Vector) -> Vector:
+        """Components along the scene's axes, as of a frame direction, to those along the cell's."""
+        return type(v)(*(v[i] for i in self._scene_axes))
+
+    def to_scene_axes(self, v: Vector) -> Vector:
+        """Components along the cell's axes to those along the scene's."""
+        return type(v)(*(v[i] for i in self._cell_axes))
 
 
 def exit_through_face(p: mi.Point3f, d: mi.Vector3f, space: Space) -> tuple[mi.Float, mi.Vector3i]:

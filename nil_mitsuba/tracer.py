@@ -7,7 +7,8 @@ sides alike: on average a surface is met as often as it should be. What a chord 
 to look: the hit is where the geodesic meets the plane of that triangle or, if that is beside the
 triangle or the surface is bent, where its tangent line meets the surface. Where the tangent finds
 nothing (silhouettes, contacts, grazing rays), the chord is cut and tried again. Everything in this
-file is in cell coordinates unless it says "scene".
+file is in cell coordinates, directions in cell axes, too, unless it says "scene". Directions that
+come in and go out, frame components, are turned to them at once and back at last.
 """
 
 from __future__ import annotations
@@ -61,9 +62,10 @@ class Cone:
 class Hit:
     """The first surface along a geodesic.
 
-    ``distance`` (cells) is arc length, ``arrival`` the frame direction there, ``cell`` the deck
-    element of the copy that was hit, ``ray`` (scene) and ``preliminary`` what Mitsuba needs to
-    compute its surface interaction, ``triangle`` what else is known if the scene has meshes.
+    ``distance`` (cells) is arc length, ``arrival`` the frame direction there (scene axes), ``cell``
+    the deck element of the copy that was hit, ``ray`` (scene) and ``preliminary`` what Mitsuba
+    needs to compute its surface interaction, ``triangle`` what else is known if the scene has
+    meshes.
     """
 
     valid: mi.Bool
@@ -219,7 +221,8 @@ class Tracer:
     def reach(self, p: mi.Point3f, v: mi.Vector3f, limit: mi.Float | None = None) -> mi.Float:
         """Arc length (cells) past which the geodesic cannot meet the scene's box any more.
 
-        At most ``limit``, which is ``max_distance`` if it is None.
+        ``v`` is a frame direction (scene axes). At most ``limit``, which is ``max_distance`` if it
+        is None.
 
         With B and H the horizontal and symmetric-vertical extent of the box seen from p, a point
         inside has |Z~| ≤ H and horizontal distance ≤ B, while |Z~| ≥ (|w| + c²/2|w|) t − c B/2|w|
@@ -230,6 +233,7 @@ class Tracer:
         if self.space.quotient:
             return limit
         far = dr.maximum(dr.abs(self.occupied.lower - p), dr.abs(self.occupied.upper - p))
+        v = self.space.to_cell_axes(v)
         k = dr.abs(self.space.twist)
         c = dr.hypot(v.x, v.y)
         w = dr.abs(v.z)
@@ -318,7 +322,8 @@ class Tracer:
         # Pieces overlap by the rounding of their joint, but none reaches behind the start.
         before = dr.select(front.t > 0, space.slack, 0)
         last = dr.fma(part, speed2 * inv_speed, before + space.slack)
-        ray = line_ray(space.to_scene(front.vertex - before * d), d, time, last * space.size)
+        o, d = space.to_scene(front.vertex - before * d), space.to_scene_axes(d)
+        ray = line_ray(o, d, time, last * space.size)
         return Chord(along, length, part, face, before, ray, base, direction)
 
     @dr.syntax
@@ -389,25 +394,29 @@ class Tracer:
         active: mi.Bool,
         time: mi.Float = 0,
     ) -> Hit:
-        """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` within ``reach``.
+        """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` (scene axes) within
+        ``reach``.
 
         In the quotient ``p`` lies in the unit cube. A hit of a ray that is seen lies off the
         geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more; where the geodesic
         only just misses what its chord meets, by the chord's error, which keeps within the cone.
         """
+        v = self.space.to_cell_axes(v)
         if self.space.flat and not self.space.quotient:
             hit = self._straight(p, v, reach, active, time)
         else:
             hit = self._along_chords(p, v, cone, reach, active, time)
+        hit.arrival = self.space.to_scene_axes(hit.arrival)
         hit.preliminary = self.shapes.within_splines(hit.preliminary, hit.ray)
         return hit
 
     def _straight(self, p, v, reach, active, time):
         """`intersect` in Euclidean space."""
-        ray = line_ray(self.space.to_scene(p), v, time, reach * self.space.size)
+        space = self.space
+        ray = line_ray(space.to_scene(p), space.to_scene_axes(v), time, reach * space.size)
         found = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         valid = found.is_valid()
-        distance = dr.select(valid, found.t * self.space.cells_per_unit, dr.inf)
+        distance = dr.select(valid, found.t * space.cells_per_unit, dr.inf)
         triangle = self.triangles.at(found)
         return Hit(valid, distance, mi.Vector3f(v), mi.Vector3i(0), ray, found, triangle)
 
@@ -519,8 +528,9 @@ class Tracer:
             met = found.compute_surface_interaction(chord.ray, mi.RayFlags.Minimal, looking)
             side = dr.sign(dr.dot(met.n, d))
             window = 0.25 * chord.length
-            rate = dr.dot(met.n, geometry.from_frame(near, arrival, k))
-            step = dr.dot(met.n, space.to_cells(met.p) - near) / rate
+            n = space.to_cell_axes(met.n)
+            rate = dr.dot(n, geometry.from_frame(near, arrival, k))
+            step = dr.dot(n, space.to_cells(met.p) - near) / rate
             step = dr.select(dr.abs(step) < 0.5 * window, step, 0)
             while looking:
                 near, arrival = geometry.short_flow(near, v, distance, step, k)
@@ -536,6 +546,7 @@ class Tracer:
                 # Nothing before the ray's own start, which may be close by its surface
                 before = dr.minimum(space.slack, (distance + s_first) * speed)
                 start = space.to_scene(dr.fma(lead, s_first, near) - before * line)
+                line = space.to_scene_axes(line)
                 last = dr.fma(s_last - s_first, speed, before + space.slack)
                 ray = line_ray(start, line, time, last * space.size)
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=looking)
@@ -565,16 +576,19 @@ class Tracer:
         active: mi.Bool,
         time: mi.Float = 0,
     ) -> mi.Bool:
-        """Whether anything stands in the way of the geodesic from ``p`` within ``reach`` (cells).
+        """Whether anything stands in the way of the geodesic from ``p`` (cells) in frame direction
+        ``v`` (scene axes) within ``reach`` (cells).
 
         The first chord begins at ``start``: off the surface on which ``p`` lies, while the last one
         ends where the geodesic does. In the quotient ``start`` lies in the unit cube.
         """
+        v = self.space.to_cell_axes(v)
         if self.space.flat and not self.space.quotient:
-            size = self.space.size
+            space = self.space
             along = dr.fma(reach, v, mi.Vector3f(p - start))
             length = dr.norm(along)
-            ray = line_ray(self.space.to_scene(start), along / length, time, length * size)
+            d = space.to_scene_axes(along / length)
+            ray = line_ray(space.to_scene(start), d, time, length * space.size)
             return self.scene.ray_test(ray, coherent=False, active=active & (reach > 0))
         return self._chords_meet(p, start, v, cone, reach, active, time)
 

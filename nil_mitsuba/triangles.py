@@ -56,6 +56,7 @@ class Triangle:
         from the point at ``b``, whatever the error of ``b``, which is corrected by what remains.
         """
         n = dr.cross(self.e1, self.e2)
+        near, along = space.to_scene_axes(near), space.to_scene_axes(along)
         there = dr.fma(self.e1, b.x, dr.fma(self.e2, b.y, self.p0 - space.origin))
         rest = mi.Vector3f(dr.fma(-space.size, near, there))
         step = dr.dot(n, rest) / dr.dot(n, along)

@@ -31,7 +31,7 @@ WRONG = [
     ("twsit", 1, 'no property "twsit": did you mean "twist"?'),
     ("maxDepth", 3, 'no property "maxDepth": did you mean "max_depth"?'),
     ("cell-size", 2.0, 'no property "cell-size": did you mean "cell_size"?'),
-    ("gravity", 9.81, 'no property "gravity", but twist, quotient, cell_origin'),
+    ("gravity", 9.81, 'no property "gravity", but twist, quotient, fibres'),
     ("twist", 0.5, "does not glue the faces of the cube: use an integer such as 0 or 1"),
     ("twist", "one", 'The property "twist" has the wrong type'),
     ("cell_size", 0.0, '"cell_size" must be greater than zero'),
