@@ -33,6 +33,7 @@ def test_what_a_callback_raises_loses_no_pass(small, tmp_path, error):
 
 CHANGES = {
     "twist": (lambda: mi.load_dict(description(twist=2)), {}, "twist is 1.0 there and 2.0 here"),
+    "fibres": (lambda: mi.load_dict(description(fibres="y")), {}, "fibres is z there and y here"),
     "size": (lambda: mi.load_dict(description(9)), {}, "size is 8,8 there and 9,9 here"),
     "layers": (lambda: mi.load_dict(description(aovs="shape")), {}, "layers is none there"),
     "seed": (lambda: mi.load_dict(description()), {"seed": 1}, "seed is 0 there and 1 here"),

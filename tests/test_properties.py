@@ -34,6 +34,8 @@ WRONG = [
     ("gravity", 9.81, 'no property "gravity", but twist, quotient, fibres'),
     ("twist", 0.5, "does not glue the faces of the cube: use an integer such as 0 or 1"),
     ("twist", "one", 'The property "twist" has the wrong type'),
+    ("fibres", "up", '"fibres" must be an axis of the scene, x, y or z, and it is "up"'),
+    ("fibres", 2, '"fibres" must be an axis of the scene, x, y or z, and it is "2"'),
     ("cell_size", 0.0, '"cell_size" must be greater than zero'),
     ("max_depth", -2, '"max_depth" must be set to -1'),
     ("aovs", "distance,normals", 'which is none of .*: did you mean "normal"?'),
