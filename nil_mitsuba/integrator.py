@@ -89,6 +89,17 @@ class NilIntegrator(ADIntegrator):
             dr.eval(image)
         return image
 
+    def space(self, general: bool = False) -> Space:
+        """The space that the parameters describe; ``general`` as of `Space`."""
+        return Space(
+            self.twist,
+            self.quotient,
+            list(self.cell_origin),
+            self.cell_size,
+            general,
+            self.fibres,
+        )
+
     def view(self, scene: mi.Scene, general: bool = False, sensor: mi.Sensor | None = None) -> View:
         """The scene as this integrator's parameters show it; ``general`` as of `Space`, ``sensor``
         the one around which empty space is known best."""
@@ -373,14 +384,7 @@ class View:
                 "keep when the scene changes: render without dr.freeze."
             )
         self.scene = scene
-        self.space = Space(
-            integrator.twist,
-            integrator.quotient,
-            list(integrator.cell_origin),
-            integrator.cell_size,
-            general,
-            integrator.fibres,
-        )
+        self.space = integrator.space(general)
         self.shapes = Shapes(scene)
         focus = None
         if sensor is not None:

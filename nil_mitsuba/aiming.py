@@ -1,0 +1,189 @@
+"""Pointing a camera: where it has to look first, so that its central geodesic meets a target."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import NamedTuple
+
+import drjit as dr
+import drjit.scalar as ds
+import mitsuba as mi
+
+from . import geometry
+
+# Sine of the angle between view and up below which rounding would turn a picture by a milliradian,
+# a pixel in a thousand.
+PARALLEL = 1e-4
+# An axis counts as upright if the camera's sides are so nearly level to it (radians): transforms
+# are often written with four digits.
+LEVEL = 1e-3
+
+
+class Aim(NamedTuple):
+    """Where a camera looks: its ``to_world``, and the way to the target (scene units)."""
+
+    to_world: mi.ScalarTransform4f
+    focus_distance: float
+
+
+def look_at(integrator_or_scene, origin, target, up=None, image=(0, 0, 0)) -> Aim:
+    """The transform of a camera whose central geodesic meets a target, and how far that is.
+
+    ``integrator_or_scene``: an integrator "nil", or a scene that has one; it says how space bends.
+    ``origin``, ``target``: points in scene coordinates. ``up``: the direction that is to be upright
+    in the picture, along the fibres if None. ``image``: in the quotient, the cell in which the
+    target's image is meant, a deck element in the order of the layer "cell"; (0, 0, 0) is the
+    target itself.
+
+    Returns ``to_world`` (for any sensor) and ``focus_distance``, the length of the shortest
+    geodesic in scene units (for the sensor "thinlens"). The rotation is read, as Mitsuba's own
+    `look_at` is at twist 0, along the axes of the scene: they stand for the left-invariant frame at
+    the camera, in which ``up`` is given, too. Raises ValueError if the target is at the camera or
+    beyond ``max_distance``, if ``up`` is parallel to the view, or if there are no images.
+    """
+    nil = integrator_or_scene
+    if isinstance(nil, mi.Scene):
+        nil = nil.integrator()
+    if not hasattr(nil, "view"):
+        raise ValueError(
+            f'look_at needs an integrator "nil", or a scene that has one, and this is '
+            f'{type(nil).__name__}: pass one such as mi.load_dict({{"type": "nil"}}).'
+        )
+    origin, target = _triple("origin", origin), _triple("target", target)
+    image = _cell(image)
+    if any(image) and not nil.quotient:
+        raise ValueError(
+            f"plain Nil has no images in other cells: image = {image} goes with the quotient only."
+        )
+
+    space = nil.space()
+    twist = space.twist_number
+    p = _exact(space.to_cells(mi.Point3f(origin)))
+    q = _exact(space.to_cells(mi.Point3f(target)))
+    deck = ds.Array3f64([i * edge for i, edge in zip(image, space.EDGES)])
+    way = geometry.connect(p, geometry.multiply(deck, q, twist), twist)
+    # Closer than a few roundings of their coordinates, points tell no direction
+    if way.distance < 2**-21 * max(*map(abs, p), *map(abs, q)):
+        raise ValueError(f"the target is where the camera is, at {_text(origin)}.")
+    if way.distance > nil.max_distance:
+        what = f"the target's image in the cell {image}" if any(image) else "the target"
+        raise ValueError(
+            f"{what} is {way.distance:.4g} cells away, and rays end at max_distance = "
+            f"{nil.max_distance:g}: raise it, or aim at something nearer."
+        )
+    view = mi.ScalarVector3f(*way.direction)
+    up = _upright(view, (0, 0, 1) if up is None else _triple("up", up))
+    T = mi.ScalarTransform4f
+    return Aim(
+        T().translate(origin) @ T().look_at([0, 0, 0], view, up),
+        way.distance * space.size_number,
+    )
+
+
+def up_of(sensor: mi.Sensor) -> tuple[float, ...]:
+    """What a sensor holds upright (scene axes): an axis if its sides are level, or its own up."""
+    right, up, _ = _columns(sensor)
+    upright = [i for i in range(3) if abs(right[i]) < LEVEL * math.hypot(*right)]
+    if not upright:
+        return tuple(up)
+    axis = max(upright, key=lambda i: abs(up[i]))
+    return tuple(math.copysign(i == axis, up[axis] if i == axis else 1) for i in range(3))
+
+
+def origin_of(sensor: mi.Sensor) -> tuple[float, ...]:
+    """Where a sensor is, in scene coordinates."""
+    matrix = sensor.world_transform().matrix
+    return tuple(matrix[i, 3][0] for i in range(3))
+
+
+def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
+    """The middle of the bounding box of the shape with an id; a scene whose meshes are merged has
+    lost theirs. Raises ValueError, with the ids there are, if it is none of them."""
+    from .shapes import extent_of  # needs a variant
+
+    named = {shape.id(): shape for shape in scene.shapes() if shape.id()}
+    if name not in named:
+        there = f"there are {', '.join(named)}" if named else "none of them has one"
+        raise ValueError(f'no shape has the id "{name}": {there}.')
+    box = extent_of(named[name]).box
+    if not box.valid():
+        raise ValueError(f'the shape "{name}" has no extent to aim at.')
+    return tuple(box.center())
+
+
+def as_xml(aim: Aim, up: tuple[float, ...], sensor: mi.Sensor) -> str:
+    """An aim as elements of a scene file, for the place of those that ``sensor`` has now.
+
+    A mirrored camera stays so, and an orthographic one, whose scale is its film's size.
+    """
+    matrix = aim.to_world.matrix
+    right, above, forward = _columns(sensor)
+    scale = [math.hypot(*column) for column in (right, above, forward)]
+    cross = [right[i - 2] * above[i - 1] - right[i - 1] * above[i - 2] for i in range(3)]
+    if sum(map(operator.mul, cross, forward)) < 0:
+        scale[0] = -scale[0]
+    # Any look from the origin and then a move: far from it, a difference would lose digits
+    view, origin = ([matrix[i, j] for i in range(3)] for j in (2, 3))
+    lines = [f'<lookat origin="0, 0, 0" target="{_numbers(view)}" up="{_numbers(up)}"/>']
+    if any(abs(s - 1) > LEVEL for s in scale):
+        lines.insert(0, f'<scale value="{_numbers(scale)}"/>')
+    lines.append(f'<translate value="{_numbers(origin)}"/>')
+    return (
+        '<transform name="to_world">\n    '
+        + "\n    ".join(lines)
+        + f'\n</transform>\n<float name="focus_distance" value="{aim.focus_distance:.9g}"/>'
+    )
+
+
+def _columns(sensor):
+    matrix = sensor.world_transform().matrix
+    return [[matrix[i, j][0] for i in range(3)] for j in range(3)]
+
+
+def _upright(view, up):
+    """``up``, if it tells where up is in a picture of what lies along ``view``."""
+    sine = math.hypot(*(view[i - 2] * up[i - 1] - view[i - 1] * up[i - 2] for i in range(3)))
+    if sine <= PARALLEL * math.hypot(*up):
+        across = min(range(3), key=lambda i: abs(view[i]))
+        other = tuple(int(i == across) for i in range(3))
+        raise ValueError(
+            f"up = {_text(up)} does not say where up is in a view along {_text(view)}: give "
+            f"another, such as {other}."
+        )
+    return up
+
+
+def _triple(name, value):
+    try:
+        if dr.is_jit_v(value) and dr.width(value) == 1:
+            value = [c[0] for c in value]
+        numbers = tuple(float(c) for c in value)
+        if len(numbers) == 3 and all(map(math.isfinite, numbers)):
+            return numbers
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f'"{name}" must be three finite numbers, and it is {value}.')
+
+
+def _cell(value):
+    try:
+        i, j, k = map(operator.index, value)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f'"image" must be three whole numbers, such as (1, 0, 0), and it is {value}.'
+        ) from None
+    return i, j, k
+
+
+def _exact(p):
+    """A point or direction of one lane in float64, as a scalar."""
+    return ds.Array3f64(*(c[0] for c in p))
+
+
+def _numbers(values):
+    return ", ".join(f"{c + 0.0:.9g}" for c in values)  # + 0.0: a zero has no sign
+
+
+def _text(values):
+    return f"({', '.join(f'{c + 0.0:.4g}' for c in values)})"
