@@ -11,6 +11,7 @@ import drjit.scalar as ds
 import mitsuba as mi
 
 from . import geometry
+from .scene_files import number_text
 
 # Sine of the angle between view and up below which rounding would turn a picture by a milliradian,
 # a pixel in a thousand.
@@ -81,20 +82,20 @@ def look_at(integrator_or_scene, origin, target, up=None, image=(0, 0, 0)) -> Ai
     )
 
 
-def up_of(sensor: mi.Sensor) -> tuple[float, ...]:
-    """What a sensor holds upright (scene axes): an axis if its sides are level, or its own up."""
-    right, up, _ = _columns(sensor)
-    upright = [i for i in range(3) if abs(right[i]) < LEVEL * math.hypot(*right)]
+def up_of(to_world: mi.Transform4f) -> tuple[float, ...]:
+    """What a camera holds upright (scene axes): an axis if its sides are level, or its own up."""
+    left, up, _, _ = columns_of(to_world)
+    upright = [i for i in range(3) if abs(left[i]) < LEVEL * math.hypot(*left)]
     if not upright:
         return tuple(up)
     axis = max(upright, key=lambda i: abs(up[i]))
-    return tuple(math.copysign(i == axis, up[axis] if i == axis else 1) for i in range(3))
+    return tuple(math.copysign(1, up[i]) if i == axis else 0.0 for i in range(3))
 
 
-def origin_of(sensor: mi.Sensor) -> tuple[float, ...]:
-    """Where a sensor is, in scene coordinates."""
-    matrix = sensor.world_transform().matrix
-    return tuple(matrix[i, 3][0] for i in range(3))
+def columns_of(to_world: mi.Transform4f) -> list[list[float]]:
+    """A camera's sides (to the left in Mitsuba), up and view, and its place, in scene axes."""
+    matrix = to_world.matrix
+    return [[matrix[i, j][0] for i in range(3)] for j in range(4)]
 
 
 def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
@@ -112,39 +113,32 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
     return tuple(box.center())
 
 
-def as_xml(aim: Aim, up: tuple[float, ...], sensor: mi.Sensor) -> str:
-    """An aim as elements of a scene file, for the place of those that ``sensor`` has now.
+def as_xml(aim: Aim, up: tuple[float, ...], before: mi.Transform4f) -> str:
+    """An aim as elements of a scene file, for a camera that was at ``before``.
 
     A mirrored camera stays so, and an orthographic one, whose scale is its film's size.
     """
-    matrix = aim.to_world.matrix
-    right, above, forward = _columns(sensor)
-    scale = [math.hypot(*column) for column in (right, above, forward)]
-    cross = [right[i - 2] * above[i - 1] - right[i - 1] * above[i - 2] for i in range(3)]
-    if sum(map(operator.mul, cross, forward)) < 0:
+    left, above, forward, _ = columns_of(before)
+    scale = [math.hypot(*column) for column in (left, above, forward)]
+    if _dot(_cross(left, above), forward) < 0:
         scale[0] = -scale[0]
-    # Any look from the origin and then a move: far from it, a difference would lose digits
+    matrix = aim.to_world.matrix
     view, origin = ([matrix[i, j] for i in range(3)] for j in (2, 3))
-    lines = [f'<lookat origin="0, 0, 0" target="{_numbers(view)}" up="{_numbers(up)}"/>']
+    # A look from the origin, and then a move: far away, a difference of points would lose digits
+    lines = [
+        f'<lookat origin="0, 0, 0" target="{_numbers(view)}" up="{_numbers(up)}"/>',
+        f'<translate value="{_numbers(origin)}"/>',
+    ]
     if any(abs(s - 1) > LEVEL for s in scale):
         lines.insert(0, f'<scale value="{_numbers(scale)}"/>')
-    lines.append(f'<translate value="{_numbers(origin)}"/>')
-    return (
-        '<transform name="to_world">\n    '
-        + "\n    ".join(lines)
-        + f'\n</transform>\n<float name="focus_distance" value="{aim.focus_distance:.9g}"/>'
+    return "\n    ".join(('<transform name="to_world">', *lines)) + (
+        f'\n</transform>\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
     )
-
-
-def _columns(sensor):
-    matrix = sensor.world_transform().matrix
-    return [[matrix[i, j][0] for i in range(3)] for j in range(3)]
 
 
 def _upright(view, up):
     """``up``, if it tells where up is in a picture of what lies along ``view``."""
-    sine = math.hypot(*(view[i - 2] * up[i - 1] - view[i - 1] * up[i - 2] for i in range(3)))
-    if sine <= PARALLEL * math.hypot(*up):
+    if math.hypot(*_cross(view, up)) <= PARALLEL * math.hypot(*up):  # view has the length 1
         across = min(range(3), key=lambda i: abs(view[i]))
         other = tuple(int(i == across) for i in range(3))
         raise ValueError(
@@ -152,6 +146,14 @@ def _upright(view, up):
             f"another, such as {other}."
         )
     return up
+
+
+def _cross(a, b):
+    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
+
+
+def _dot(a, b):
+    return sum(map(operator.mul, a, b))
 
 
 def _triple(name, value):
@@ -182,7 +184,7 @@ def _exact(p):
 
 
 def _numbers(values):
-    return ", ".join(f"{c + 0.0:.9g}" for c in values)  # + 0.0: a zero has no sign
+    return ", ".join(map(number_text, values))
 
 
 def _text(values):

@@ -29,34 +29,13 @@ class Camera:
     """A sensor's rays in Nil."""
 
     def __init__(self, sensor: mi.Sensor, space: Space, tolerance: float):
-        name = sensor.class_name()
-        if name not in SENSORS:
-            raise RuntimeError(
-                f'the integrator "nil" has no meaning for the sensor "{name}": use '
-                f"{', '.join(SENSORS.values())}."
-            )
         self.space = space
         self.tolerance = dr.opaque(mi.Float, tolerance)
-        self.thinlens = name == "ThinLensCamera"
-
+        self.thinlens = sensor.class_name() == "ThinLensCamera"
         parameters = mi.traverse(sensor)
-        if name == "BatchSensor":
-            # A batch lists its children's parameters behind their names.
-            children = [
-                key[: -len("shutter_open")]
-                for key in parameters.keys()
-                if key.endswith(".shutter_open")
-            ]
-            for child in children:
-                turned = f"{child}to_world" in parameters
-                if not turned or f"{child}aperture_radius" in parameters:
-                    raise RuntimeError(
-                        f'the integrator "nil" renders perspective and orthographic sensors inside '
-                        f'a batch, and "{child[:-1]}" is neither: render it as a sensor of its own.'
-                    )
-            self.views = [_Frustum(parameters, child) for child in children]
-        else:
-            self.views = [_Frustum(parameters, "", sensor.world_transform())]
+        self.views = [
+            _Frustum(parameters, child, transform) for child, transform in transforms(sensor)
+        ]
         if self.thinlens:
             self.focus_distance = opaque(mi.Float(parameters["focus_distance"]))
 
@@ -120,12 +99,36 @@ class Camera:
         return lens, mi.Vector3f(geometry.connect(lens, focus, k).direction)
 
 
+def transforms(sensor: mi.Sensor) -> list[tuple[str, mi.Transform4f]]:
+    """To the world from each sensor of a batch, or from a sensor that is none; with the prefix of
+    its parameters. Raises RuntimeError for a sensor that "nil" does not render."""
+    name = sensor.class_name()
+    if name not in SENSORS:
+        raise RuntimeError(
+            f'the integrator "nil" has no meaning for the sensor "{name}": use '
+            f"{', '.join(SENSORS.values())}."
+        )
+    if name != "BatchSensor":
+        return [("", sensor.world_transform())]
+    # A batch lists its children's parameters behind their names.
+    parameters = mi.traverse(sensor)
+    children = [
+        key[: -len("shutter_open")] for key in parameters.keys() if key.endswith(".shutter_open")
+    ]
+    for child in children:
+        turned = f"{child}to_world" in parameters
+        if not turned or f"{child}aperture_radius" in parameters:
+            raise RuntimeError(
+                f'the integrator "nil" renders perspective and orthographic sensors inside '
+                f'a batch, and "{child[:-1]}" is neither: render it as a sensor of its own.'
+            )
+    return [(child, mi.Transform4f(parameters[f"{child}to_world"])) for child in children]
+
+
 class _Frustum:
     """Where one sensor is, and how far from it its rays begin."""
 
-    def __init__(self, parameters, prefix, transform=None):
-        if transform is None:
-            transform = mi.Transform4f(parameters[f"{prefix}to_world"])
+    def __init__(self, parameters, prefix, transform):
         self.origin = opaque(mi.Point3f(transform @ mi.Point3f(0)))
         axis = mi.Vector3f(transform @ mi.Vector3f(0, 0, 1))
         self.axis = opaque(dr.normalize(axis))

@@ -22,8 +22,9 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, checkpoint, exr, jobs, png, stills
+from . import __version__, aiming, checkpoint, exr, jobs, png, stills
 from .errors import cause_of
+from .fitting import FITS
 from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .registration import refusal
@@ -91,12 +92,50 @@ class PassRange(click.ParamType):
         self.fail(f'expected a:b with a < b, such as 0:8, and "{value}" is not.', param, ctx)
 
 
+class Triple(click.ParamType):
+    """``x,y,z`` as three finite numbers, or whole numbers ``i,j,k``."""
+
+    def __init__(self, kind: type = float):
+        self.kind = kind
+        self.name = "x,y,z" if kind is float else "i,j,k"
+
+    def convert(self, value, param, ctx):
+        with contextlib.suppress(ValueError):
+            numbers = tuple(map(self.kind, value.split(",")))
+            if len(numbers) == 3 and all(map(math.isfinite, numbers)):
+                return numbers
+        numbers = "numbers" if self.kind is float else "whole numbers"
+        self.fail(f'expected three {numbers} {self.name}, and "{value}" is not.', param, ctx)
+
+
+class Target(Triple):
+    """A point ``x,y,z``, or else the id of a shape."""
+
+    name = "x,y,z or SHAPE-ID"
+
+    def convert(self, value, param, ctx):
+        with contextlib.suppress(click.BadParameter):
+            return super().convert(value, param, ctx)
+        return value
+
+
 class Stopped(click.ClickException):
     """A signal ended the command; the status says which."""
 
     def __init__(self, sentence: str, number: int):
         super().__init__(sentence)
         self.exit_code = 128 + number
+
+
+class FittingCommand(click.Command):
+    """A command whose option ``--fit`` may stand without a value, before an argument, too."""
+
+    def parse_args(self, ctx, args):
+        args = [
+            "--fit=shapes" if arg == "--fit" and following not in FITS else arg
+            for arg, following in zip(args, [*args[1:], ""], strict=False)
+        ]
+        return super().parse_args(ctx, args)
 
 
 class PassesOption(click.Option):
@@ -146,7 +185,7 @@ class RenderOptions(PictureOptions):
     quiet: bool
     verbose: int
     properties: tuple[tuple[str, str], ...]
-    fit: bool
+    fit: str | None
 
     def note(self, sentence: str) -> None:
         """Say something that is no error."""
@@ -238,7 +277,52 @@ def picture_options(command):
     return command
 
 
-@cli.command()
+def scene_options(command):
+    """The options on how a scene is read, and which space it is in."""
+    for option in reversed(
+        (
+            click.option(
+                "-m", "--mode", metavar="VARIANT", default="llvm_ad_rgb", show_default=True
+            ),
+            click.option(
+                "-D",
+                "--define",
+                type=Assignment(),
+                multiple=True,
+                help='Define a constant that the scene refers to as "$key".',
+            ),
+            click.option(
+                "-s",
+                "--sensor",
+                metavar="INDEX",
+                type=click.IntRange(0),
+                default=0,
+                show_default=True,
+                help="Sensor to take, in the scene's order.",
+            ),
+            click.option(
+                "-P",
+                "--property",
+                "properties",
+                metavar="NAME=VALUE",
+                type=Assignment(),
+                multiple=True,
+                help='Set a property of the integrator "nil", such as twist=0 or '
+                "cell_origin=-1,-1,-1.",
+            ),
+            click.option(
+                "--fit",
+                type=click.Choice(list(FITS)),
+                metavar="[camera]",
+                help="Fit the cell to the shapes, or to the shapes and the camera; say what it is.",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+@cli.command(cls=FittingCommand)
 @click.argument("scene", metavar="SCENE.xml")
 @click.option(
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
@@ -282,36 +366,10 @@ def picture_options(command):
 )
 @passes_option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
 @passes_option("--workers", type=click.IntRange(1), help="Render in so many processes.")
-@click.option("-m", "--mode", metavar="VARIANT", default="llvm_ad_rgb", show_default=True)
-@click.option(
-    "-D",
-    "--define",
-    type=Assignment(),
-    multiple=True,
-    help='Define a constant that the scene refers to as "$key".',
-)
-@click.option(
-    "-s",
-    "--sensor",
-    metavar="INDEX",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Sensor to render with, in the scene's order.",
-)
+@scene_options
 @click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
-@click.option(
-    "-P",
-    "--property",
-    "properties",
-    metavar="NAME=VALUE",
-    type=Assignment(),
-    multiple=True,
-    help='Set a property of the integrator "nil", such as twist=0 or cell_origin=-1,-1,-1.',
-)
-@click.option("--fit", is_flag=True, help="Fit the cell to the scene's bounding box.")
 def render(**options):
     """Render a scene with the integrator "nil", whatever integrator it names.
 
@@ -319,6 +377,44 @@ def render(**options):
     rendered, save the samples and write the picture so far.
     """
     _render(RenderOptions(**options))
+
+
+@cli.command(cls=FittingCommand)
+@click.argument("scene", metavar="SCENE.xml")
+@click.option(
+    "--at", type=Target(), required=True, help="Where to look: a point, or the middle of a shape."
+)
+@click.option(
+    "--image", type=Triple(int), default="0,0,0", show_default=True, help="In which cell's copy."
+)
+@click.option("--from", "origin", type=Triple(), help="Where from, if not from the sensor.")
+@click.option("--up", type=Triple(), help="What is to be upright, if not what the sensor holds so.")
+@scene_options
+def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
+    """Print the XML of a camera that looks at something, and how far that is.
+
+    It takes the place of the sensor's to_world and focus_distance. Geodesics bend: the look_at of a
+    target's coordinates misses it.
+    """
+    if origin and fit == "camera":
+        raise click.UsageError(
+            "--fit camera holds the sensor where the scene has it, and --from moves it: fit first."
+        )
+    _scene_path(scene)
+    _set_variant(mode)
+    job = jobs.Job(scene, mode, dict(define), dict(properties), sensor, fit=fit)
+    opened = jobs.open_scene(job, _note, merge=False)
+    camera = opened.scene.sensors()[sensor]
+    if camera.class_name() == "BatchSensor":
+        raise click.ClickException(
+            f"the sensor {sensor} is a batch of several: aim at a copy of the scene with one."
+        )
+    before = camera.world_transform()
+    target = aiming.middle_of(opened.scene, at) if isinstance(at, str) else at
+    up = up or aiming.up_of(before)
+    origin = origin or aiming.columns_of(before)[3]
+    found = aiming.look_at(opened.integrator, origin, target, up, image)
+    click.echo(aiming.as_xml(found, up, before))
 
 
 @cli.command()
@@ -434,10 +530,7 @@ def tidy(text: str) -> str:
 
 
 def _render(options: RenderOptions) -> None:
-    scene = Path(options.scene)
-    if not scene.is_file():
-        what = "is not a file" if scene.exists() else "does not exist"
-        raise click.ClickException(f'the scene "{scene}" {what}.')
+    scene = _scene_path(options.scene)
     paths = _paths(scene, options)
     try:
         rules = stills.check_rules(options.spp, options.seconds, options.noise)
@@ -755,6 +848,14 @@ def _paths(scene: Path, options: RenderOptions) -> Paths:
         _output_path(options.png, ".png", "--png") if options.png else None,
         _output_path(options.checkpoint or exr_path.with_suffix(SUMS), SUMS, "--checkpoint"),
     )
+
+
+def _scene_path(name: str) -> Path:
+    scene = Path(name)
+    if not scene.is_file():
+        what = "is not a file" if scene.exists() else "does not exist"
+        raise click.ClickException(f'the scene "{scene}" {what}.')
+    return scene
 
 
 def _require_denoiser() -> None:

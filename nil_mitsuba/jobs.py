@@ -14,8 +14,9 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from .fitting import fit
 from .layers import GUIDES
-from .scene_files import SceneFiles, fitted_cell
+from .scene_files import SceneFiles
 from .stills import Rules, Still
 
 
@@ -27,7 +28,8 @@ class Job:
     "nil", the layers among them ("aovs"). ``spp`` and ``pass_spp`` (samples per pixel, of the image
     and of a pass) may be None, for the scene's and for as many as fit; ``scene_hash`` too, for
     whatever lies there. ``denoise`` asks for what denoising needs: a film with the filter "box" and
-    the layers that guide it. ``fit`` fits the cell to the scene's bounding box.
+    the layers that guide it. ``fit`` names what the cell is fitted to, as in ``fitting.FITS``;
+    None leaves it as it is.
     """
 
     path: str
@@ -40,7 +42,7 @@ class Job:
     pass_spp: int | None = None
     scene_hash: str | None = None
     denoise: bool = False
-    fit: bool = False
+    fit: str | None = None
 
 
 class Opened(NamedTuple):
@@ -63,12 +65,14 @@ class Opened(NamedTuple):
         )
 
 
-def open_scene(job: Job, note: Callable[[str], None] = lambda _: None) -> Opened:
+def open_scene(
+    job: Job, note: Callable[[str], None] = lambda _: None, merge: bool = True
+) -> Opened:
     """Load a job's scene; sets the job's variant.
 
-    ``note`` is told, in sentences, what differs from the scene file. Raises ValueError,
-    RuntimeError or OSError with a sentence if the scene cannot be loaded, or if it is not the one
-    with the job's hash.
+    ``note`` is told, in sentences, what differs from the scene file. Without ``merge`` meshes keep
+    their ids, and take longer to render. Raises ValueError, RuntimeError or OSError with a sentence
+    if the scene cannot be loaded, or if it is not the one with the job's hash.
     """
     mi.set_variant(job.variant)
     with _beside(job.path), _enough_threads():
@@ -85,24 +89,26 @@ def open_scene(job: Job, note: Callable[[str], None] = lambda _: None) -> Opened
             raise ValueError(f'"{job.path}" or a file that it names differs from the one expected.')
         layers = getattr(integrator, "layers", ())
         # Merged meshes have no numbers of their own
-        scene = files.scene(merge="shape" not in layers)
+        scene = files.scene(merge=merge and "shape" not in layers)
+        sensors = scene.sensors()
+        if not sensors:
+            raise ValueError(f'the scene "{job.path}" has no sensor.')
+        if job.sensor >= len(sensors):
+            raise ValueError(
+                f'the scene "{job.path}" has no sensor {job.sensor}: its sensors are numbered '
+                f"from 0 to {len(sensors) - 1}."
+            )
         further: dict[str, str] = {}
         if job.fit:
-            further |= fitted_cell(scene)
-            note("--fit: " + " ".join(f"{name}={value}" for name, value in further.items()))
+            fitted = fit(scene, sensors[job.sensor], integrator, job.fit)
+            further |= fitted.properties
+            for sentence in fitted.notes:
+                note(sentence)
         if job.denoise:
             further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
         if further:
             integrator = files.integrator(**further)
-    sensors = len(scene.sensors())
-    if not sensors:
-        raise ValueError(f'the scene "{job.path}" has no sensor.')
-    if job.sensor >= sensors:
-        raise ValueError(
-            f'the scene "{job.path}" has no sensor {job.sensor}: its sensors are numbered from 0 '
-            f"to {sensors - 1}."
-        )
-    job = replace(job, properties=job.properties | further, scene_hash=scene_hash, fit=False)
+    job = replace(job, properties=job.properties | further, scene_hash=scene_hash, fit=None)
     return Opened(job, scene, integrator, layers)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
+import struct
 from pathlib import Path
 
 import mitsuba as mi
 
 # The options that a scene's own integrator shares with "nil": they survive its replacement.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
-
-FIT_MARGIN = 1e-3  # of the scene's largest extent: keeps walls clear of the cube's faces
 
 
 class SceneFiles:
@@ -179,14 +178,10 @@ def parse_value(text: str):
     return text
 
 
-def fitted_cell(scene) -> dict[str, str]:
-    """Properties of "nil" whose cell is the smallest cube around a scene, as text."""
-    from .shapes import Shapes  # needs a variant
-
-    bbox = Shapes(scene).box
-    if not bbox.valid() or max(bbox.extents()) == 0:
-        raise ValueError("--fit needs a scene with shapes of some extent.")
-    size = max(bbox.extents()) * (1 + FIT_MARGIN)
-    origin = bbox.center() - size / 2
-    # 9 digits give a float32 back
-    return {"cell_origin": ",".join(f"{c:.9g}" for c in origin), "cell_size": f"{size:.9g}"}
+def number_text(number: float) -> str:
+    """A float32 with as many digits as give it back."""
+    for digits in range(6, 10):  # 9 digits always do
+        text = f"{number + 0.0:.{digits}g}"  # + 0.0: a zero has no sign
+        if struct.pack("f", float(text)) == struct.pack("f", number):
+            break
+    return text
