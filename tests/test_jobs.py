@@ -42,7 +42,7 @@ def job(tmp_path, rgb):
         spp=8,
         pass_spp=4,
         seed=3,
-        fit=True,
+        fit="shapes",
         denoise=True,
         properties={"aovs": "distance", "twist": "2"},
     )

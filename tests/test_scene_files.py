@@ -1,13 +1,12 @@
 """Scene files as others wrote them, with `nil` put in; the hash of what they show."""
 
 import os
-import re
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
-from command_line import LAMP, NIL, SENSOR, complaint, read, remarks, scene
+from command_line import LAMP, NIL, SENSOR, read, remarks, scene
 from nil_mitsuba import scene_files
 from nil_mitsuba.scene_files import SceneFiles
 from small_stills import TRIANGLE
@@ -74,31 +73,6 @@ def test_meshes_includes_and_constants_are_found_from_any_folder(command, folder
     header, _, pixels = read("a/scene.exr")
     assert header["spp"] == 16
     assert dr.max(pixels.array)[0] > 0.5
-
-
-def test_fit_puts_the_scene_into_the_cell(command, folder):
-    lamp = LAMP.replace('x="0.5"', 'x="-7"')
-    (folder / "scene.xml").write_text(scene(SENSOR, lamp))
-    status, _, err = command("render", "scene.xml", "--fit")
-    assert status == 0
-    corner, size = re.search(r"cell_origin=(\S+) cell_size=(\S+)", err).groups()
-    x, y, z = map(float, corner.split(","))
-    size = float(size)
-    assert size == pytest.approx(0.3 * (1 + 1e-3), rel=1e-6)
-    assert (x + size / 2, y + size / 2, z + size / 2) == pytest.approx((-7, 0.5, 0.7), rel=1e-6)
-    assert read("scene.exr")[0]["cell_origin"] == corner
-
-    # What --fit prints can be typed in.
-    status, _, _ = command(
-        "render", "scene.xml", "-P", f"cell_origin={corner}", "-P", f"cell_size={size!r}"
-    )
-    assert (status, read("scene.exr")[0]["cell_origin"]) == (0, corner)
-
-
-def test_fit_needs_something_to_fit(command, folder):
-    (folder / "scene.xml").write_text(scene(NIL, SENSOR))
-    status, _, err = command("render", "scene.xml", "--fit")
-    assert status == 1 and "--fit needs a scene" in complaint(err)
 
 
 @pytest.mark.parametrize(

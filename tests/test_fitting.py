@@ -1,0 +1,94 @@
+"""A cell that is fitted to a scene, to its camera, and what is said of it."""
+
+import re
+
+import mitsuba as mi
+import pytest
+
+from command_line import LAMP, NIL, SENSOR, complaint, read, scene
+from nil_mitsuba import fitting
+
+FAR_LAMP = LAMP.replace('x="0.5"', 'x="-7"')  # from the camera at (0.5, 0.5, 0.1)
+UPRIGHT = SENSOR.replace('target="0.5, 0.5, 1" up="0, 1, 0"', 'target="0.5, 1, 0.1" up="0, 0, 1"')
+
+
+@pytest.fixture
+def fitted(command, folder):
+    """Renders a scene with a fitted cell: the cell's corner and edge, and what was said."""
+
+    def run(*parts, fit=("--fit",), more=()):
+        (folder / "scene.xml").write_text(scene(*parts))
+        status, _, err = command("render", *fit, "scene.xml", "-o", "a.exr", *more)
+        assert status == 0, err
+        header = read("a.exr")[0]
+        return [float(c) for c in header["cell_origin"].split(",")], header["cell_size"], err
+
+    return run
+
+
+def test_fit_puts_the_shapes_into_the_smallest_cell(fitted):
+    corner, size, _ = fitted(NIL, SENSOR, FAR_LAMP)
+    assert size == pytest.approx(0.3 * (1 + 1e-3), rel=1e-6)
+    assert [c + size / 2 for c in corner] == pytest.approx((-7, 0.5, 0.7), rel=1e-6)
+
+
+@pytest.mark.parametrize("fit", ["--fit", "--fit=camera"])
+def test_what_fit_prints_keeps_its_cell(fitted, fit):
+    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, fit=[fit])
+    lines = re.findall("^ +(.*cell_size.*|.*cell_origin.*)$", err, re.M)
+    options = lines.pop().split()
+    assert fitted(NIL, SENSOR, FAR_LAMP, fit=[], more=options)[:2] == (corner, size)
+    nil = f'<integrator type="nil">{"".join(lines)}</integrator>'
+    assert fitted(nil, SENSOR, FAR_LAMP, fit=[])[:2] == (corner, size)
+
+
+def test_a_camera_outside_of_the_fitted_cell_is_told_what_becomes_of_it(fitted):
+    _, _, err = fitted(NIL, SENSOR, FAR_LAMP)
+    (warning,) = (line for line in err.splitlines() if "outside" in line)
+    assert "the camera at (0.5, 0.5, 0.1) lies outside" in warning
+    assert "--fit camera takes" in warning
+    # In plain Nil nothing is carried, nor with a camera that the shapes surround
+    assert "outside" not in fitted(NIL, SENSOR, FAR_LAMP, more=["-P", "quotient=false"])[2]
+    assert "outside" not in fitted(NIL, SENSOR, LAMP.replace("0.15", "3"))[2]
+
+
+@pytest.mark.parametrize("fit", [("--fit", "camera"), ("--fit=camera",)])
+def test_fit_camera_holds_shapes_and_camera_clear_of_the_faces(fitted, fit):
+    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, fit=fit)
+    assert size == pytest.approx((0.5 + 7.15) * (1 + 1e-3), rel=1e-6)
+    for point in ((0.5, 0.5, 0.1), (-7.15, 0.35, 0.55), (-6.85, 0.65, 0.85)):
+        assert all(c + 4e-4 * size < x < c + (1 - 4e-4) * size for c, x in zip(corner, point))
+    assert "outside" not in err
+
+
+def test_fit_camera_holds_every_sensor_of_a_batch(rgb):
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 2, "height": 2}
+    batch = {"type": "batch", "film": film | {"width": 4}}
+    for i, x in enumerate((-3, 5)):
+        batch[f"eye{i}"] = {
+            "type": "perspective",
+            "to_world": T().look_at([x, 0, 0], [x, 1, 0], [0, 0, 1]),
+            "film": film,
+        }
+    loaded = mi.load_dict({"type": "scene", "batch": batch, "ball": {"type": "sphere"}})
+    nil = mi.load_dict({"type": "nil"})
+    found = fitting.fit(loaded, loaded.sensors()[0], nil, "camera")
+    assert float(found.properties["cell_size"]) == pytest.approx(8 * (1 + 1e-3), rel=1e-6)
+    assert not [note for note in found.notes if "fibres" in note or "outside" in note]
+    found = fitting.fit(loaded, loaded.sensors()[0], nil, "shapes")
+    assert [note for note in found.notes if "the camera at (-3, 0, 0) lies outside" in note]
+
+
+def test_fibres_are_suggested_along_the_cameras_up(fitted):
+    err = fitted(NIL, SENSOR, LAMP)[2]  # y is up
+    assert '<string name="fibres" value="y"/>\n    -P fibres=y\n' in err
+    assert "fibres" not in fitted(NIL, UPRIGHT, LAMP)[2]
+
+
+def test_fit_needs_something_to_fit(command, folder):
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR))
+    status, _, err = command("render", "scene.xml", "--fit")
+    assert status == 1 and "--fit needs a scene" in complaint(err)
+    status, _, err = command("render", "scene.xml", "--fit=walls")
+    assert status == 2 and "'walls' is not one of" in complaint(err)
