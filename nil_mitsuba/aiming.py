@@ -105,7 +105,7 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
 
     named = {shape.id(): shape for shape in scene.shapes() if shape.id()}
     if name not in named:
-        there = f"there are {', '.join(named)}" if named else "none of them has one"
+        there = f"there are {', '.join(named)}" if named else "none has one, so give a point"
         raise ValueError(f'no shape has the id "{name}": {there}.')
     box = extent_of(named[name]).box
     if not box.valid():

@@ -104,19 +104,20 @@ class Triple(click.ParamType):
             numbers = tuple(map(self.kind, value.split(",")))
             if len(numbers) == 3 and all(map(math.isfinite, numbers)):
                 return numbers
-        numbers = "numbers" if self.kind is float else "whole numbers"
-        self.fail(f'expected three {numbers} {self.name}, and "{value}" is not.', param, ctx)
+        what = "numbers" if self.kind is float else "whole numbers"
+        self.fail(f'expected three {what} {self.name}, and "{value}" is not.', param, ctx)
 
 
-class Target(Triple):
+class Target(click.ParamType):
     """A point ``x,y,z``, or else the id of a shape."""
 
-    name = "x,y,z or SHAPE-ID"
+    name = "x,y,z|SHAPE-ID"
 
     def convert(self, value, param, ctx):
-        with contextlib.suppress(click.BadParameter):
-            return super().convert(value, param, ctx)
-        return value
+        try:
+            return Triple().convert(value, param, ctx)
+        except click.BadParameter:
+            return value
 
 
 class Stopped(click.ClickException):
