@@ -112,9 +112,54 @@ def test_any_mesh_stands_in_the_cube(rgb, tmp_path):
 
     own_mesh = runpy.run_path(str(ROOT / "examples" / "own_mesh.py"))
     foot, extent = own_mesh["FOOT"], own_mesh["EXTENT"]
-    box = rgb.load_dict(own_mesh["fitted"](mesh, "y")).bbox()
+    box = own_mesh["load"](mesh, "y").bbox()
     assert dr.allclose(box.min, [foot[0] - extent / 18, foot[1] - extent / 18, foot[2]], atol=1e-5)
     assert dr.allclose(box.max.z, foot[2] + extent, atol=1e-5)
+
+
+COLOURED = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+property uchar alpha
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 0 188 0 255
+1 0 0 0 188 0 255
+.5 0 1 0 188 0 255
+3 0 1 2
+"""
+
+
+@pytest.mark.parametrize("kind", ["material", "texture", "vertices"])
+def test_own_mesh_keeps_its_colours(rgb, tmp_path, kind):
+    """188 is half of the light in sRGB."""
+    green = rgb.Bitmap(rgb.TensorXf([0.0, 0.5, 0.0], (1, 1, 3)))
+    (tmp_path / "maps").mkdir()
+    path = tmp_path / "maps" / "green.png"
+    green.convert(component_format=rgb.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    (tmp_path / "paint.mtl").write_text("newmtl a\nKd 1 0 0\nmap_Kd -s 1 1 1 maps\\green.png\n")
+    (tmp_path / "mesh.obj").write_text(
+        ("mtllib paint.mtl\n" if kind == "material" else "")
+        + "v 0 0 0\nv 1 0 0\nv .5 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "mesh.ply").write_text(COLOURED)
+    own_mesh = runpy.run_path(str(ROOT / "examples" / "own_mesh.py"))
+    file = tmp_path / ("mesh.ply" if kind == "vertices" else "mesh.obj")
+    texture = own_mesh["texture_of"](file)
+    assert texture == (path if kind == "material" else None)
+    mesh = own_mesh["load"](file, "z", path if kind == "texture" else texture)
+    scene = rgb.load_dict({"type": "scene", "mesh": mesh})
+    (x, y, _), z = own_mesh["FOOT"], own_mesh["FOOT"][2] + 0.1
+    si = scene.ray_intersect(rgb.Ray3f([x, y - 1, z], [0, 1, 0]))
+    seen = si.bsdf().eval_diffuse_reflectance(si)
+    assert dr.allclose(seen, [0, 0.5, 0], atol=0.01)
 
 
 def test_own_mesh_says_what_it_reads():
