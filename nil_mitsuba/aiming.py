@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from textwrap import shorten
 from typing import NamedTuple
 
 import drjit as dr
@@ -11,6 +12,7 @@ import drjit.scalar as ds
 import mitsuba as mi
 
 from . import geometry
+from .parameters import nearest
 from .scene_files import number_text
 
 # Sine of the angle between view and up below which rounding would turn a picture by a milliradian,
@@ -105,8 +107,13 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
 
     named = {shape.id(): shape for shape in scene.shapes() if shape.id()}
     if name not in named:
-        there = f"there are {', '.join(named)}" if named else "none has one, so give a point"
-        raise ValueError(f'no shape has the id "{name}": {there}.')
+        near = nearest(name, named)
+        there = f"there are {shorten(', '.join(named), 1000, placeholder=' ...')}"
+        raise ValueError(
+            f'no shape has the id "{name}": '
+            + (f'did you mean "{near}"? ' if near else "")
+            + (f"{there}." if named else "none has one, so give a point.")
+        )
     box = extent_of(named[name]).box
     if not box.valid():
         raise ValueError(f'the shape "{name}" has no extent to aim at.')

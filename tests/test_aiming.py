@@ -284,7 +284,8 @@ def test_one_of_several_sensors_is_aimed(command, folder):
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["--at", "bix"], 'no shape has the id "bix": there are box, other.'),
+        (["--at", "wall"], 'no shape has the id "wall": there are box, other.'),
+        (["--at", "bix"], 'no shape has the id "bix": did you mean "box"? there are box, other.'),
         (["--at", "0.2,0.1,0.7"], "the target is where the camera is, at (0.2, 0.1, 0.7)."),
         (["--at", "box", "--image", "40,0,0"], "max_distance = 12"),
         (["--at", "box", "--image", "1,0"], 'expected three whole numbers i,j,k, and "1,0" is not'),
