@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Sequence
 from textwrap import shorten
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ PARALLEL = 1e-4
 # An axis counts as upright if the camera's sides are so nearly level to it (radians): transforms
 # are often written with four digits.
 LEVEL = 1e-3
+FAR = 1e15  # scene units, as of shapes
 
 
 class Aim(NamedTuple):
@@ -30,7 +32,13 @@ class Aim(NamedTuple):
     focus_distance: float
 
 
-def look_at(integrator_or_scene, origin, target, up=None, image=(0, 0, 0)) -> Aim:
+def look_at(
+    integrator_or_scene: mi.Integrator | mi.Scene,
+    origin: Sequence[float],
+    target: Sequence[float],
+    up: Sequence[float] | None = None,
+    image: Sequence[int] = (0, 0, 0),
+) -> Aim:
     """The transform of a camera whose central geodesic meets a target, and how far that is.
 
     ``integrator_or_scene``: an integrator "nil", or a scene that has one; it says how space bends.
@@ -69,7 +77,7 @@ def look_at(integrator_or_scene, origin, target, up=None, image=(0, 0, 0)) -> Ai
     # Closer than a few roundings of their coordinates, points tell no direction
     if way.distance < 2**-21 * max(*map(abs, p), *map(abs, q)):
         raise ValueError(f"the target is where the camera is, at {_text(origin)}.")
-    if way.distance > nil.max_distance:
+    if not way.distance <= nil.max_distance:  # nor if it is no number
         what = f"the target's image in the cell {image}" if any(image) else "the target"
         raise ValueError(
             f"{what} is {way.distance:.4g} cells away, and rays end at max_distance = "
@@ -120,12 +128,12 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
     return tuple(box.center())
 
 
-def as_xml(aim: Aim, up: tuple[float, ...], before: mi.Transform4f) -> str:
-    """An aim as elements of a scene file, for a camera that was at ``before``.
+def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:
+    """An aim as elements of a scene file, for the place of those that a sensor has now.
 
     A mirrored camera stays so, and an orthographic one, whose scale is its film's size.
     """
-    left, above, forward, _ = columns_of(before)
+    left, above, forward, _ = columns_of(sensor.world_transform())
     scale = [math.hypot(*column) for column in (left, above, forward)]
     if _dot(_cross(left, above), forward) < 0:
         scale[0] = -scale[0]
@@ -138,9 +146,10 @@ def as_xml(aim: Aim, up: tuple[float, ...], before: mi.Transform4f) -> str:
     ]
     if any(abs(s - 1) > LEVEL for s in scale):
         lines.insert(0, f'<scale value="{_numbers(scale)}"/>')
-    return "\n    ".join(('<transform name="to_world">', *lines)) + (
-        f'\n</transform>\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
-    )
+    text = "\n    ".join(('<transform name="to_world">', *lines)) + "\n</transform>"
+    if "near_clip" in mi.traverse(sensor):  # Mitsuba's other sensors refuse a focus
+        text += f'\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
+    return text
 
 
 def _upright(view, up):
@@ -168,11 +177,11 @@ def _triple(name, value):
         if dr.is_jit_v(value) and dr.width(value) == 1:
             value = [c[0] for c in value]
         numbers = tuple(float(c) for c in value)
-        if len(numbers) == 3 and all(map(math.isfinite, numbers)):
+        if len(numbers) == 3 and all(abs(c) < FAR for c in numbers):
             return numbers
     except (TypeError, ValueError):
         pass
-    raise ValueError(f'"{name}" must be three finite numbers, and it is {value}.')
+    raise ValueError(f'"{name}" must be three numbers below 1e15, and it is {value}.')
 
 
 def _cell(value):

@@ -415,7 +415,7 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
     up = up or aiming.up_of(before)
     origin = origin or aiming.columns_of(before)[3]
     found = aiming.look_at(opened.integrator, origin, target, up, image)
-    click.echo(aiming.as_xml(found, up, before))
+    click.echo(aiming.as_xml(found, up, camera))
 
 
 @cli.command()

@@ -154,16 +154,18 @@ def test_a_scene_is_as_good_as_its_integrator(rgb):
         ({}, {"target": EYE}, r"^the target is where the camera is, at \(0.2, 0.1, 0.7\)\.$"),
         ({}, {"target": (0.2, 0.1, 0.7 + 1e-8)}, "^the target is where the camera is"),
         ({}, {"image": (20, 0, 0)}, r"image in the cell \(20, 0, 0\) is 20.* max_distance = 12"),
+        ({}, {"image": (10**200, 0, 0)}, "rays end at max_distance = 12"),
         ({"max_distance": 0.5}, {}, "^the target is 0.98.* cells away, .* max_distance = 0.5"),
         ({"quotient": False}, {"image": (0, 1, 0)}, r"^plain Nil has no images .*\(0, 1, 0\)"),
         ({}, {"image": (0.5, 0, 0)}, '"image" must be three whole numbers'),
         ({}, {"image": 3}, '"image" must be three whole numbers'),
         ({}, {"target": (0.2, 0.1, 0.2)}, r"^up = \(0, 0, 1\) does not say .* such as \(1, 0, 0\)"),
         ({}, {"up": (0, 0, 0)}, "does not say where up is"),
-        ({}, {"origin": (1, 2)}, '^"origin" must be three finite numbers'),
-        ({}, {"target": (1, 2, math.inf)}, '^"target" must be three finite numbers'),
-        ({}, {"target": "ball"}, '^"target" must be three finite numbers, and it is ball'),
-        ({}, {"up": (0, math.nan, 1)}, '^"up" must be three finite numbers'),
+        ({}, {"origin": (1, 2)}, '^"origin" must be three numbers below 1e15'),
+        ({}, {"target": (1, 2, math.inf)}, '^"target" must be three numbers below 1e15'),
+        ({}, {"target": (1e38, 0, 0)}, '^"target" must be three numbers below 1e15'),
+        ({}, {"target": "ball"}, '^"target" must be three numbers below 1e15, and it is ball'),
+        ({}, {"up": (0, math.nan, 1)}, '^"up" must be three numbers below 1e15'),
     ],
 )
 def test_where_nothing_can_be_aimed_at_is_told(rgb, parameters, arguments, sentence):
@@ -272,6 +274,14 @@ def test_what_the_command_prints_can_be_pasted(aim, kind, scale, more, options):
     assert aiming.up_of(after) == ((0, 1, 0) if "--up" in options else (0, 0, 1))
     if kind == "thinlens":
         assert mi.traverse(sensor)["focus_distance"][0] == pytest.approx(distance, rel=1e-6)
+
+
+def test_a_radiancemeter_has_no_focus(command, folder):
+    meter = CAMERA.format(kind="radiancemeter", scale="", more="").replace('value="8"', 'value="1"')
+    meter = meter.replace('<float name="near_clip" value="0.001"/>', "")
+    (folder / "scene.xml").write_text(scene(NIL, meter))
+    status, out, _ = command("aim", "scene.xml", "--at", "-0.6,0.8,0.4")
+    assert status == 0 and "</transform>" in out and "focus" not in out
 
 
 def test_one_of_several_sensors_is_aimed(command, folder):

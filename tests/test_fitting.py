@@ -47,6 +47,8 @@ def test_a_camera_outside_of_the_fitted_cell_is_told_what_becomes_of_it(fitted):
     (warning,) = (line for line in err.splitlines() if "outside" in line)
     assert "the camera at (0.5, 0.5, 0.1) lies outside" in warning
     assert "--fit camera takes" in warning
+    behind = LAMP.replace('z="0.7"', 'z="-0.7"')
+    assert "lies outside" in fitted(NIL, SENSOR, behind)[2]
     # In plain Nil nothing is carried, nor with a camera that the shapes surround
     assert "outside" not in fitted(NIL, SENSOR, FAR_LAMP, more=["-P", "quotient=false"])[2]
     assert "outside" not in fitted(NIL, SENSOR, LAMP.replace("0.15", "3"))[2]
