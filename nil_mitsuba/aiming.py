@@ -83,8 +83,9 @@ def look_at(
             f"{what} is {way.distance:.4g} cells away, and rays end at max_distance = "
             f"{nil.max_distance:g}: raise it, or aim at something nearer."
         )
-    view = mi.ScalarVector3f(*way.direction)
-    up = _upright(view, (0, 0, 1) if up is None else _triple("up", up))
+    view = mi.ScalarVector3f(*space.to_scene_axes(way.direction))
+    fibres = tuple(space.to_scene_axes(ds.Array3f64(0, 0, 1)))
+    up = _upright(view, fibres if up is None else _triple("up", up))
     T = mi.ScalarTransform4f
     return Aim(
         T().translate(origin) @ T().look_at([0, 0, 0], view, up),

@@ -19,13 +19,14 @@ def nil(**parameters):
 
 
 def central(sensor, integrator, lens=None):
-    """Start (cells) and direction of the rays through the middle of the picture."""
+    """Start (cells) and direction (cell axes) of the rays through the middle of the picture."""
     from nil_mitsuba.camera import Camera
 
     lens = mi.Point2f(0.5) if lens is None else lens
     ray, _ = sensor.sample_ray_differential(0, 0.5, mi.Point2f(0.5), lens)
-    camera = Camera(sensor, integrator.space(), integrator.tolerance)
-    return camera.start(ray, mi.Float(0.5))[:2]
+    space = integrator.space()
+    p, v, _, _ = Camera(sensor, space, integrator.tolerance).start(ray, mi.Float(0.5))
+    return p, space.to_cell_axes(v)
 
 
 def camera_at(to_world, kind="perspective", **more):
@@ -50,6 +51,8 @@ SPACES = [
     ({"twist": 0.0}, (1, 1, -2)),
     ({"twist": 2.5, "quotient": False}, (0, 0, 0)),
     ({"twist": 1.0, "cell_size": 40.0, "cell_origin": [-10.0, 5.0, -20.0]}, (1, 2, 1)),
+    ({"twist": 1.0, "fibres": "y", "cell_size": 3.0}, (2, -1, 1)),
+    ({"twist": 2.0, "fibres": "x", "cell_origin": [1.0, 2.0, 3.0]}, (0, 1, 2)),
 ]
 
 
@@ -97,11 +100,11 @@ def test_at_twist_zero_it_is_mitsubas_look_at(rgb, up):
 
 
 def test_what_is_up_stands_upright_in_the_picture(rgb):
-    integrator = nil(twist=3, quotient=False)
-    for up in (None, (1, 0, 0), (0, -1, 2)):
+    for up, fibres in ((None, "z"), (None, "x"), ((1, 0, 0), "z"), ((0, -1, 2), "y")):
+        integrator = nil(twist=3, quotient=False, fibres=fibres)
         matrix = look_at(integrator, EYE, TARGET, up).to_world.matrix
         left, above = ([matrix[i, j] for i in range(3)] for j in (0, 1))
-        up = up or (0, 0, 1)  # the fibres
+        up = up or [axis == fibres for axis in "xyz"]
         assert sum(a * b for a, b in zip(left, up)) == pytest.approx(0, abs=1e-6)
         assert sum(a * b for a, b in zip(above, up)) > 0
 
@@ -121,12 +124,14 @@ def test_a_camera_is_aimed_alike_wherever_an_isometry_takes_it(rgb):
     assert there.focus_distance == pytest.approx(here.focus_distance, rel=1e-6)
 
 
-@pytest.mark.parametrize("parameters, image", SPACES[:3])
+@pytest.mark.parametrize("parameters, image", [*SPACES[:3], SPACES[-1]])
 def test_a_thin_lens_is_sharp_at_the_focus_distance(rgb, parameters, image):
     """Rays from all over the lens go on to the image of the target, and from its rim elsewhere if
     the lens is focused a fifth further away."""
     integrator = nil(**parameters)
-    to_world, distance = look_at(integrator, EYE, TARGET, image=image)
+    place = integrator.space().to_scene
+    eye, target = (list(zip(*place(mi.Point3f(p))))[0] for p in (EYE, TARGET))
+    to_world, distance = look_at(integrator, eye, target, image=image)
     rng = mi.PCG32(100)
     lens = mi.Point2f(rng.next_float32(), rng.next_float32())
     target = geometry.multiply(mi.Point3i(image), mi.Point3f(TARGET), integrator.twist)
@@ -248,7 +253,7 @@ def aim(command, folder):
     [
         ("perspective", "", "", ["--at", "box"]),
         ("perspective", '<scale x="-1"/>', "", ["--at", "0.6,0.8,0.4", "--image", "1,0,-1"]),
-        ("orthographic", '<scale value="0.3"/>', "", ["--at", "box", "-P", "twist=2"]),
+        ("orthographic", '<scale value="0.3"/>', "", ["--at", "box", "-P", "fibres=y"]),
         (
             "thinlens",
             "",
@@ -261,9 +266,9 @@ def test_what_the_command_prints_can_be_pasted(aim, kind, scale, more, options):
     camera = CAMERA.format(kind=kind, scale=scale, more=more)
     before = mi.load_string(scene(camera)).sensors()[0].world_transform()
     sensor, distance = aim(camera, *options)
-    integrator = nil(twist=2 if "twist=2" in options else 1)
+    integrator = nil(fibres="y" if "fibres=y" in options else "z")
     there, cell = arrival(sensor, integrator, distance)
-    assert dr.allclose(there, mi.Point3f(TARGET), atol=1e-5)
+    assert dr.allclose(integrator.space().to_scene(there), mi.Point3f(TARGET), atol=1e-5)
     if "--image" in options:
         assert [int(c[0]) for c in cell] == [1, 0, -1]
     # A mirrored or scaled camera stays so, and stands where it stood

@@ -85,6 +85,9 @@ def test_fit_camera_holds_every_sensor_of_a_batch(rgb):
 def test_fibres_are_suggested_along_the_cameras_up(fitted):
     err = fitted(NIL, SENSOR, LAMP)[2]  # y is up
     assert '<string name="fibres" value="y"/>\n    -P fibres=y\n' in err
+    assert "fibres" not in fitted(NIL, SENSOR, LAMP, more=["-P", "fibres=y"])[2]
+    upright = '<integrator type="nil"><string name="fibres" value="y"/></integrator>'
+    assert "fibres" not in fitted(upright, SENSOR, LAMP)[2]
     assert "fibres" not in fitted(NIL, UPRIGHT, LAMP)[2]
 
 
