@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 
-from .aiming import columns_of, up_of
+from .aiming import columns_of, look_at, up_of
 from .scene_files import number_text
 
 MARGIN = 1e-3  # of the scene's largest extent: keeps walls and camera clear of the cube's faces
+NEAR = 5.0  # degrees, a tenth of a common field of view: a target so near the middle is seen well
 
 # What the cell may be fitted to, by the word behind --fit
 FITS = {"shapes": "the shapes", "camera": "the shapes and the camera"}
@@ -17,16 +20,21 @@ FITS = {"shapes": "the shapes", "camera": "the shapes and the camera"}
 
 @dataclass(frozen=True)
 class Fit:
-    """Properties of "nil", as text, and in sentences what they mean for the scene's camera."""
+    """Properties of "nil", as text; in sentences what they mean for the scene's camera; and what
+    options of the command follow from those."""
 
     properties: dict[str, str]
     notes: list[str]
+    options: str
 
 
 def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fit:
-    """The smallest cubic cell that holds ``what``, a key of `FITS`.
+    """A cell as large as the smallest cube around ``what``, a key of `FITS`.
 
-    Raises ValueError if the scene has no shapes of some extent.
+    In the quotient the cell is that cube. In plain Nil, where nothing has to lie within a cell, the
+    group's identity comes halfway from the camera to what it looks at: between points with the
+    cell coordinates (x, y) and (x', y') a picture leans by k (y' − y)(x + x')/2, which is nothing
+    there. Raises ValueError if the scene has no shapes of some extent.
     """
     from .camera import transforms  # needs a variant
     from .shapes import Shapes
@@ -34,40 +42,120 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     box = Shapes(scene).box
     if not box.valid() or max(box.extents()) == 0:
         raise ValueError("--fit needs a scene with shapes of some extent.")
+    middle = box.center()
     views = [transform for _, transform in transforms(sensor)]
     cameras = [columns_of(view)[3] for view in views]
     if what == "camera":
         for camera in cameras:
             box.expand(camera)
     size = max(box.extents()) * (1 + MARGIN)
-    origin = box.center() - size / 2
+    corner = box.center() - size / 2
+    quotient = getattr(nil, "quotient", True)
+    target = _looked_at(scene, views[0]) or list(middle)
+    halfway = [(a + b) / 2 for a, b in zip(cameras[0], target, strict=True)]
     properties = {
         "cell_size": number_text(size),
-        "cell_origin": ",".join(map(number_text, origin)),
+        "cell_origin": ",".join(map(number_text, corner if quotient else halfway)),
     }
+    where = (
+        f"the cell is the smallest cube around {FITS[what]}"
+        if quotient
+        else f"the cell is as wide as {FITS[what]}, and its origin is halfway from the camera to "
+        "what it looks at, where the picture leans least"
+    )
     notes = [
-        f"--fit: the cell is the smallest cube around {FITS[what]}. It is kept by these lines in "
-        f"the integrator, or by these options of the command:\n{_kept(properties)}"
+        f"--fit: {where}. It is kept by these lines in the integrator, or by these options of the "
+        f"command:\n{_kept(properties)}"
     ]
-    outside = [
-        camera
-        for camera in cameras
-        if not all(c < x < c + size for c, x in zip(origin, camera, strict=True))
-    ]
-    if outside and getattr(nil, "quotient", True):
-        place = ", ".join(f"{c:.4g}" for c in outside[0])
+    options = "--fit"
+    outside = [camera for camera in cameras if not _holds(corner, size, camera)]
+    way = math.dist(cameras[0], target) / size
+    if quotient and outside:
+        options = "--fit camera"
         notes.append(
-            f"--fit: the camera at ({place}) lies outside of this cell: it is carried into it, and "
-            "is likely to see walls; --fit camera takes the smallest cell that holds it, too."
+            f"--fit: the camera at {_text(outside[0])} lies outside of this cell: it is carried "
+            "into it, and is likely to see walls; --fit camera takes the smallest cell that holds "
+            "it, too."
+        )
+    elif way > 1 and what != "camera":  # a cell's way turns light by a radian at most, at twist 1
+        options = "--fit camera"
+        notes.append(
+            f"--fit: what the camera looks at is {way:.2g} cells away, and light bends strongly on "
+            "so long a way; --fit camera takes a larger cell, in which it bends less."
         )
     fibres = getattr(nil, "fibres", "z")
     _, up = max(zip(map(abs, up_of(views[0])), "xyz", strict=True))
     if up != fibres:
+        options += f" -P fibres={up}"
         notes.append(
             f"--fit: the camera's up is {up}, and the fibres run along {fibres}; this lets the "
             f"fibres run upright:\n{_kept({'fibres': up})}"
         )
-    return Fit(properties, notes)
+    if not (quotient and outside):
+        space = {"cell_size": size, "cell_origin": corner if quotient else halfway, "fibres": up}
+        angle = _miss(nil, space, views[0], target)
+        if angle > NEAR:
+            notes.append(
+                f"--fit: bent light passes what the camera looks at, {_text(target)}, by "
+                f'{angle:.0f} degrees: "nil-mitsuba aim" with the options of this command and '
+                f"--at {','.join(f'{c:.4g}' for c in target)} prints the to_world that looks at it."
+            )
+    return Fit(properties, notes, options)
+
+
+def _miss(nil, space, view, target):
+    """By how many degrees a camera's central geodesic misses what it looks at in flat space."""
+    bent = mi.load_dict(
+        {
+            "type": "nil",
+            "twist": getattr(nil, "twist", 1.0),
+            "quotient": getattr(nil, "quotient", True),
+            "max_distance": 1e6,  # cells: any target is within reach
+        }
+        | space
+    )
+    _, up, forward, origin = columns_of(view)
+    try:
+        aimed = look_at(bent, origin, target, up)
+    except ValueError:  # the camera stands on it, or looks along its up
+        return 0.0
+    cosine = sum(a * aimed.to_world.matrix[i, 2] for i, a in enumerate(forward))
+    return math.degrees(math.acos(max(-1.0, min(1.0, cosine / math.hypot(*forward)))))
+
+
+def unfitted(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator) -> str | None:
+    """One sentence on what to do if the cell does not hold the shapes of a scene, or None."""
+    from .shapes import Shapes  # needs a variant
+
+    box = Shapes(scene).box
+    size, corner = getattr(nil, "cell_size", 1.0), getattr(nil, "cell_origin", (0, 0, 0))
+    if not box.valid() or not max(box.extents()):
+        return None
+    if all(_holds(corner, size, point) for point in (box.min, box.max)):
+        return None
+    options = fit(scene, sensor, nil, "shapes").options
+    return (
+        f"the shapes reach from {_text(box.min)} to {_text(box.max)}, and the cell from "
+        f"{_text(corner)} to {_text([c + size for c in corner])}: "
+        f"add {options} to fit it to them."
+    )
+
+
+def _holds(corner, size, point):
+    """Whether a cube in the scene holds a point within it, not on its faces."""
+    return all(c < x < c + size for c, x in zip(corner, point, strict=True))
+
+
+def _looked_at(scene, view):
+    """The point that a camera looks at where space is flat, or None."""
+    _, _, forward, origin = columns_of(view)
+    ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(forward)))
+    hit = scene.ray_intersect_preliminary(ray)
+    return [c[0] for c in ray(hit.t)] if hit.is_valid()[0] else None
+
+
+def _text(point):
+    return f"({', '.join(f'{c:.4g}' for c in point)})"
 
 
 TYPES = {"cell_size": "float", "cell_origin": "point", "fibres": "string"}

@@ -337,11 +337,12 @@ class NilIntegrator(ADIntegrator):
 
 
 def _warn_of_what_is_ignored(scene, shapes, integrator):
-    """Log one warning each for shapes outside the quotient's cube, for what of them lies nowhere,
-    and for media."""
+    """Log a warning of the shapes outside the quotient's cube, and one each for what of a shape
+    lies nowhere, and for media."""
     lower = list(integrator.cell_origin)
     upper = [c + integrator.cell_size for c in lower]
     margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
+    outside = []
     for shape, extent in zip(shapes.shapes, shapes.extents):
         if extent.lost:
             mi.Log(
@@ -353,14 +354,18 @@ def _warn_of_what_is_ignored(scene, shapes, integrator):
             box = extent.box
             reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
         if reach > margin:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"nil: the shape {name_of(shape)} reaches {reach:.4g} scene units out of the "
-                f"cube {lower} to {upper}: what lies outside is never seen. Move it, or set "
-                "cell_origin and cell_size.",
-            )
+            outside.append((reach, name_of(shape)))
         if shape.is_medium_transition():
             mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is ignored.")
+    if outside:
+        reach, name = max(outside)
+        others = f" (the farthest of {len(outside)})" if len(outside) > 1 else ""
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"nil: the shape {name} reaches {reach:.4g} scene units out of the cube {lower} to "
+            f"{upper}{others}: what lies outside is never seen. Move it, or set cell_origin and "
+            "cell_size.",
+        )
     for kind, endpoints in (("sensor", scene.sensors()), ("emitter", scene.emitters())):
         for endpoint in endpoints:
             if endpoint.get_medium() is not None:

@@ -14,10 +14,12 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from .fitting import fit
+from .fitting import fit, unfitted
 from .layers import GUIDES
 from .scene_files import SceneFiles
 from .stills import Rules, Still
+
+CELL = {"cell_origin", "cell_size"}
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,10 @@ def open_scene(
             further |= fitted.properties
             for sentence in fitted.notes:
                 note(sentence)
+        elif files.notes and not CELL & job.properties.keys():
+            sentence = unfitted(scene, sensors[job.sensor], integrator)
+            if sentence:
+                note(f"{job.path}: {sentence}")
         if job.denoise:
             further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
         if further:
