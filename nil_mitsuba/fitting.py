@@ -32,9 +32,10 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     """A cell as large as the smallest cube around ``what``, a key of `FITS`.
 
     In the quotient the cell is that cube. In plain Nil, where nothing has to lie within a cell, the
-    group's identity comes halfway from the camera to what it looks at: between points with the
-    cell coordinates (x, y) and (x', y') a picture leans by k (y' − y)(x + x')/2, which is nothing
-    there. Raises ValueError if the scene has no shapes of some extent.
+    group's identity comes halfway from the camera to the middle of the shapes: between points with
+    the cell coordinates (x, y) and (x', y') a picture leans by k (y' − y)(x + x')/2, which is
+    nothing there. It does not depend on where the camera looks: an aimed one keeps it. Raises
+    ValueError if the scene has no shapes of some extent.
     """
     from .camera import transforms  # needs a variant
     from .shapes import Shapes
@@ -51,8 +52,7 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     size = max(box.extents()) * (1 + MARGIN)
     corner = box.center() - size / 2
     quotient = getattr(nil, "quotient", True)
-    target = _looked_at(scene, views[0]) or list(middle)
-    halfway = [(a + b) / 2 for a, b in zip(cameras[0], target, strict=True)]
+    halfway = [(a + b) / 2 for a, b in zip(cameras[0], middle, strict=True)]
     properties = {
         "cell_size": number_text(size),
         "cell_origin": ",".join(map(number_text, corner if quotient else halfway)),
@@ -61,7 +61,7 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
         f"the cell is the smallest cube around {FITS[what]}"
         if quotient
         else f"the cell is as wide as {FITS[what]}, and its origin is halfway from the camera to "
-        "what it looks at, where the picture leans least"
+        "the middle of the shapes, where the picture leans least"
     )
     notes = [
         f"--fit: {where}. It is kept by these lines in the integrator, or by these options of the "
@@ -69,7 +69,7 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     ]
     options = "--fit"
     outside = [camera for camera in cameras if not _holds(corner, size, camera)]
-    way = math.dist(cameras[0], target) / size
+    way = math.dist(cameras[0], middle) / size
     if quotient and outside:
         options = "--fit camera"
         notes.append(
@@ -77,11 +77,12 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
             "into it, and is likely to see walls; --fit camera takes the smallest cell that holds "
             "it, too."
         )
-    elif way > 1 and what != "camera":  # a cell's way turns light by a radian at most, at twist 1
+    elif way > 1 and what != "camera":  # light turns by a radian a cell at most, at twist 1
         options = "--fit camera"
         notes.append(
-            f"--fit: what the camera looks at is {way:.2g} cells away, and light bends strongly on "
-            "so long a way; --fit camera takes a larger cell, in which it bends less."
+            f"--fit: the middle of the shapes is {way:.2g} cells away from the camera, and light "
+            "bends strongly on so long a way; --fit camera takes a larger cell, in which it bends "
+            "less."
         )
     fibres = getattr(nil, "fibres", "z")
     _, up = max(zip(map(abs, up_of(views[0])), "xyz", strict=True))
@@ -91,14 +92,16 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
             f"--fit: the camera's up is {up}, and the fibres run along {fibres}; this lets the "
             f"fibres run upright:\n{_kept({'fibres': up})}"
         )
-    if not (quotient and outside):
+    target = _looked_at(scene, views[0])
+    if target and not (quotient and outside):
         space = {"cell_size": size, "cell_origin": corner if quotient else halfway, "fibres": up}
         angle = _miss(nil, space, views[0], target)
         if angle > NEAR:
             notes.append(
-                f"--fit: bent light passes what the camera looks at, {_text(target)}, by "
-                f'{angle:.0f} degrees: "nil-mitsuba aim" with the options of this command and '
-                f"--at {','.join(f'{c:.4g}' for c in target)} prints the to_world that looks at it."
+                f"--fit: in flat space the camera looks at {_text(target)}, which is seen "
+                f'{angle:.0f} degrees off the middle now: unless it is aimed, "nil-mitsuba aim" '
+                f"with the options of this command and --at {_text(target, ',')[1:-1]} prints the "
+                "to_world that looks there."
             )
     return Fit(properties, notes, options)
 
@@ -154,8 +157,8 @@ def _looked_at(scene, view):
     return [c[0] for c in ray(hit.t)] if hit.is_valid()[0] else None
 
 
-def _text(point):
-    return f"({', '.join(f'{c:.4g}' for c in point)})"
+def _text(point, comma=", "):
+    return f"({comma.join(f'{c:.4g}' for c in point)})"
 
 
 TYPES = {"cell_size": "float", "cell_origin": "point", "fibres": "string"}

@@ -19,7 +19,7 @@ from .layers import GUIDES
 from .scene_files import SceneFiles
 from .stills import Rules, Still
 
-CELL = {"cell_origin", "cell_size"}
+CELL = {"cell_origin", "cell_size"}  # who sets these has fitted the cell
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ def open_scene(
     mi.set_variant(job.variant)
     with _beside(job.path), _enough_threads():
         files = SceneFiles(job.path, job.defines, job.properties)
+        foreign = bool(files.notes)  # not written for "nil", which was put into it
         if job.denoise:
             files.use_box_filter()
         for sentence in files.notes:
@@ -106,10 +107,10 @@ def open_scene(
             further |= fitted.properties
             for sentence in fitted.notes:
                 note(sentence)
-        elif files.notes and not CELL & job.properties.keys():
-            sentence = unfitted(scene, sensors[job.sensor], integrator)
-            if sentence:
-                note(f"{job.path}: {sentence}")
+        elif foreign and not CELL & job.properties.keys():
+            advice = unfitted(scene, sensors[job.sensor], integrator)
+            if advice:
+                note(f"{job.path}: {advice}")
         if job.denoise:
             further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
         if further:

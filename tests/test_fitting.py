@@ -91,6 +91,45 @@ def test_fibres_are_suggested_along_the_cameras_up(fitted):
     assert "fibres" not in fitted(NIL, UPRIGHT, LAMP)[2]
 
 
+def test_the_identity_of_plain_nil_is_halfway_from_the_camera_to_the_shapes(fitted):
+    plain = ["-P", "quotient=false"]
+    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, more=plain)
+    assert corner == pytest.approx(((0.5 - 7) / 2, 0.5, (0.1 + 0.7) / 2), rel=1e-5)
+    assert size == pytest.approx(0.3 * (1 + 1e-3), rel=1e-6)
+    assert "is 25 cells away from the camera" in err and "--fit camera takes a larger" in err
+    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, fit=["--fit=camera"], more=plain)
+    assert corner == pytest.approx(((0.5 - 7) / 2, 0.5, (0.1 + 0.7) / 2), rel=1e-5)
+    assert size == pytest.approx((0.5 + 7.15) * (1 + 1e-3), rel=1e-6)
+    assert "cells away" not in err
+
+
+def test_what_the_flat_camera_looked_at_is_offered_to_aim(fitted):
+    tilted = SENSOR.replace('origin="0.5, 0.5, 0.1"', 'origin="0.9, 0.9, 0.1"')
+    tilted = tilted.replace('target="0.5, 0.5, 1"', 'target="0.5, 0.5, 0.7"')
+    err = fitted(NIL, tilted, LAMP, fit=["--fit=camera"])[2]
+    (x, y, z) = map(float, re.search("--at (.*),(.*),(.*) prints the to_world", err).groups())
+    assert (x - 0.5) ** 2 + (y - 0.5) ** 2 + (z - 0.7) ** 2 == pytest.approx(0.15**2, rel=1e-2)
+    assert (
+        "to_world" not in fitted(NIL, tilted, LAMP, fit=["--fit=camera"], more=["-P", "twist=0"])[2]
+    )
+
+
+def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(fitted):
+    path = '<integrator type="path"/>'
+    err = fitted(path, SENSOR, FAR_LAMP, fit=[])[2]
+    assert ": add --fit camera -P fibres=y to fit it to them.\n" in err
+    upright = fitted(path, UPRIGHT, FAR_LAMP, fit=[], more=["-P", "quotient=false"])[2]
+    assert ": add --fit camera to fit it to them.\n" in upright
+    # A scene for "nil", one that is fitted, by hand or not, or one that fits
+    for parts, fit, more in (
+        ((NIL, SENSOR, FAR_LAMP), (), ()),
+        ((path, SENSOR, FAR_LAMP), ("--fit",), ()),
+        ((path, SENSOR, FAR_LAMP), (), ("-P", "cell_size=2")),
+        ((path, SENSOR, LAMP), (), ()),
+    ):
+        assert "to fit it to them" not in fitted(*parts, fit=fit, more=more)[2]
+
+
 def test_fit_needs_something_to_fit(command, folder):
     (folder / "scene.xml").write_text(scene(NIL, SENSOR))
     status, _, err = command("render", "scene.xml", "--fit")

@@ -1,3 +1,4 @@
+import re
 import sys
 
 import drjit as dr
@@ -188,3 +189,14 @@ def test_shapes_outside_the_cube_and_media_are_named(rgb, capfd):
     assert '"outside" reaches 0.15 scene units out of the cube' in text
     assert 'medium of the shape "cloud" is ignored' in text
     assert '"inside"' not in text
+
+
+def test_many_shapes_outside_the_cube_are_one_warning(rgb, capfd):
+    mi = rgb
+    ball = {"type": "sphere", "radius": 0.2}
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    scene = {"type": "scene", "sensor": {"type": "perspective", "film": film}}
+    scene |= {f"ball{i}": ball | {"center": [i, 0.5, 0.5]} for i in range(1, 8)}
+    mi.render(mi.load_dict(scene), integrator=mi.load_dict({"type": "nil"}), spp=1)
+    (warning,) = re.findall(r"nil: the shape .*", capfd.readouterr().out)
+    assert '"ball7" reaches 6.2 scene units' in warning and "(the farthest of 7)" in warning
