@@ -315,7 +315,8 @@ def scene_options(command):
                 "--fit",
                 type=click.Choice(list(FITS)),
                 metavar="[camera]",
-                help="Fit the cell to the shapes, or to the shapes and the camera; say what it is.",
+                help="Fit the cell to the shapes, or to the shapes and the camera; in plain Nil "
+                "with its origin halfway between those. Say what it is, and what else to do.",
             ),
         )
     ):
@@ -397,9 +398,10 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
     It takes the place of the sensor's to_world and focus_distance. Geodesics bend: the look_at of a
     target's coordinates misses it.
     """
-    if origin and fit == "camera":
+    if origin and fit:
         raise click.UsageError(
-            "--fit camera holds the sensor where the scene has it, and --from moves it: fit first."
+            "--fit goes by where the scene has the sensor, and --from moves it: fit first, and "
+            "give the -P that it prints."
         )
     _scene_path(scene)
     _set_variant(mode)

@@ -309,6 +309,7 @@ def test_one_of_several_sensors_is_aimed(command, folder):
         (["--at", "0.2,0.1,0.1"], "up = (0, 0, 1) does not say where up is"),
         (["--at", "box", "-s", "1"], "has no sensor 1"),
         (["--at", "box", "--from", "0,0,0", "--fit", "camera"], "--from moves it"),
+        (["--at", "box", "--from", "0,0,0", "--fit"], "give the -P that it prints"),
     ],
 )
 def test_what_cannot_be_aimed_at_is_told_in_one_sentence(command, folder, arguments, sentence):
