@@ -1,6 +1,6 @@
-"""Make the pictures of "How to look at Nil".
+"""Make the pictures of "How to look at Nil" and "A scene of your own".
 
-Needs altair and vl-convert-python for its diagrams.
+Needs altair and vl-convert-python for its diagrams, and the denoiser.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import argparse
 import math
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.Jit will use
@@ -22,6 +23,9 @@ from nil_mitsuba import geometry
 
 DOCS = Path(__file__).resolve().parent
 EXAMPLES = DOCS.parent / "examples"
+
+sys.path.append(str(EXAMPLES))
+from sheet import contact_sheet  # noqa: E402
 
 
 def glued_faces(path, size):
@@ -108,6 +112,35 @@ def leaning_fibres(path, size, spp):
     mi.util.write_bitmap(str(path), picture, write_async=False, quality=90)
 
 
+# The room of "A scene of your own": straight, bent in plain Nil, and in the quotient
+PLAIN = "-P quotient=false -P fibres=y "
+ROOMS = (
+    PLAIN + "-P twist=0",
+    PLAIN + "-P cell_size=10 -P cell_origin=0,1,0",
+    PLAIN + "-P cell_size=5 -P cell_origin=0,1,0",
+    PLAIN + "-P cell_size=5 -P cell_origin=0,1,-5",
+    "-P fibres=y -P cell_size=5.005 -P cell_origin=-2.5025,-1.5025,-1.0025",
+)
+
+
+def own_scene(path, size, spp):
+    """The room as the command renders it, with other options side by side."""
+    pictures = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, options in enumerate(ROOMS):
+            png = Path(folder) / f"{number}.png"
+            words = f"-D resx={size} -D resy={size} --spp {spp} --denoise -q {options}".split()
+            room = ["render", str(DOCS / "room.xml"), "-o", str(png.with_suffix(".exr"))]
+            command = "from nil_mitsuba.cli import main; main()"
+            subprocess.run(
+                [sys.executable, "-c", command, *room, "--png", str(png), *words], check=True
+            )
+            picture = mi.Bitmap(str(png)).convert(component_format=mi.Struct.Type.Float32)
+            pictures.append(mi.TensorXf(picture.convert(srgb_gamma=False)))
+    sheet = contact_sheet(pictures, len(pictures))
+    mi.util.write_bitmap(str(path), sheet, write_async=False, quality=90)
+
+
 def example(program, output, *arguments):
     """Run a program of examples/; a JPEG is made from its PNG, for Mitsuba's default is large."""
     png = output.with_suffix(".png")
@@ -142,7 +175,8 @@ def main():
         "--spp",
         str(max(1, spp // 2)),
     )
-    print(f"{options.to}: five pictures for looking-at-nil.md")
+    own_scene(options.to / "own-scene.jpg", size // 4, max(1, spp // 2))
+    print(f"{options.to}: five pictures for looking-at-nil.md, one for your-own-scene.md")
 
 
 if __name__ == "__main__":

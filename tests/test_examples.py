@@ -254,7 +254,8 @@ def test_pictures_of_the_explanation_are_made_by_their_script(rgb, tmp_path):
     )
     assert result.returncode == 0, result.stderr
     pictures = sorted(path.name for path in tmp_path.iterdir())
-    text = (ROOT / "docs" / "looking-at-nil.md").read_text(encoding="utf-8")
+    pages = [ROOT / "docs" / f"{name}.md" for name in ("looking-at-nil", "your-own-scene")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     assert pictures == sorted(re.findall(r"!\[[^]]*\]\(([\w-]+\.\w+)\)", text))
     for name in pictures:
         shows_something(rgb, tmp_path / name)

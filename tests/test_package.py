@@ -50,6 +50,8 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
 def test_who_cites_the_software_names_the_version_that_is_installed():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [nil_mitsuba.__version__]
+    bibtex = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"^ +version += \{(.*)\}$", bibtex, re.MULTILINE) == [nil_mitsuba.__version__]
 
 
 def test_the_map_names_every_module_and_where_it_is_tested():

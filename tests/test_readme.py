@@ -1,4 +1,5 @@
-"""Every command and code block of the README runs, at a small size."""
+"""Every code block of the README and of the pages in docs/ runs, at a small size; links lead
+somewhere."""
 
 import re
 import shlex
@@ -8,13 +9,26 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from conftest import ENVIRONMENT
+from nil_mitsuba import look_at
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+HOUSE = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\(([^)\s#]*)#?([^)\s]*)\)")
+
+
+def read(page):
+    return page.read_text(encoding="utf-8")
+
+
+BLOCKS = [block for page in PAGES for block in BLOCK.findall(read(page))]
 
 # Programs that another test runs at a small size.
 TESTED_BY = {
@@ -35,8 +49,28 @@ QUICK = (
 )
 
 
-def blocks(*languages):
-    return [text for language, text in BLOCKS if language in languages]
+def blocks(language):
+    """Code of a language, once where pages share it."""
+    return list(dict.fromkeys(text for name, text in BLOCKS if name == language))
+
+
+def printed_by(block):
+    """What a page says that commands print: the text right behind them, if there is one."""
+    language, text = [*BLOCKS, ("", "")][BLOCKS.index(("sh", block)) + 1]
+    return text if language == "text" else ""
+
+
+def headings(page):
+    """The anchors of a page, as GitHub makes them."""
+    found = re.findall(r"^#+ (.*)$", BLOCK.sub("", read(page)), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in found}
+
+
+def links(page):
+    """The files and anchors that a page names."""
+    for path, anchor in LINK.findall(BLOCK.sub("", read(page))):
+        if not path.startswith("http"):
+            yield (page.parent / path).resolve() if path else page, anchor
 
 
 def lines(block):
@@ -58,7 +92,7 @@ def desk(tmp_path_factory):
         "Makefile",
         "pyproject.toml",
         "README.md",
-        "docs",
+        "docs",  # pictures of its scene go elsewhere
     ):
         (folder / name).symlink_to(ROOT / name)
     (folder / "hello.xml").write_text(blocks("xml")[0])
@@ -70,11 +104,34 @@ def run(desk, arguments):
         arguments, cwd=desk, capture_output=True, text=True, timeout=600, env=ENVIRONMENT
     )
     assert result.returncode == 0, f"{shlex.join(map(str, arguments))}\n{result.stderr[-2000:]}"
+    return result.stdout + result.stderr
 
 
-def test_the_readme_has_code_of_each_kind():
-    assert {"sh", "xml", "python"} <= {language for language, _ in BLOCKS}
-    assert all(language for language, _ in BLOCKS), "a block without a language is not tested"
+def test_the_readme_is_short_and_shows_code_of_each_kind():
+    assert len(README.read_bytes()) < 10_000
+    assert {"sh", "xml", "python"} <= {language for language, _ in BLOCK.findall(read(README))}
+
+
+def test_no_block_is_of_a_language_that_nothing_runs():
+    assert {language for language, _ in BLOCKS} <= {"sh", "xml", "python", "text", "bibtex"}
+
+
+@pytest.mark.parametrize("page", HOUSE, ids=lambda page: page.name)
+def test_links_lead_to_files_and_headings_that_exist(page):
+    for path, anchor in links(page):
+        assert path.exists(), path
+        assert not anchor or anchor in headings(path), f"{path.name}#{anchor}"
+
+
+def test_every_page_is_linked_from_the_readme():
+    assert set(PAGES) - {README} <= {path for path, _ in links(README)}
+
+
+def test_the_first_scene_is_aimed_at_its_ball(rgb):
+    scene = mi.load_string(blocks("xml")[0])
+    aim = look_at(scene, [0.1, 0.1, 0.6], [0.5, 0.5, 0.5])
+    placed = scene.sensors()[0].world_transform().matrix
+    assert dr.allclose(placed, mi.Matrix4f(aim.to_world.matrix), atol=1e-3)
 
 
 @pytest.mark.parametrize("text", blocks("xml"))
@@ -84,21 +141,21 @@ def test_xml_is_whole(text):
 
 @pytest.mark.parametrize("text", blocks("python"))
 def test_python_runs(desk, text):
-    small = re.sub(r"\b256\b", "16", text)
+    small = re.sub(r"\b256\b", "16", text).replace("noise=0.1", "noise=0.5")
     run(desk, [sys.executable, "-c", small])
 
 
 @pytest.mark.parametrize("block", blocks("sh"), ids=lambda block: lines(block)[0])
 def test_commands_run(desk, block):
-    for line in lines(block):
-        run_small(desk, line)
+    printed = [run_small(desk, line) for line in lines(block)]
+    assert " ".join(printed_by(block).split()) in " ".join(" ".join(printed).split())
 
 
 def run_small(desk, line):
     program, *words = shlex.split(line)
     command = [sys.executable, "-c", "from nil_mitsuba.cli import main; main()"]
     if program == "make":
-        run(desk, ["make", "--dry-run", *words])
+        return run(desk, ["make", "--dry-run", *words])
     elif program == "pip":
         # tests/test_package.py installs the wheel; here, that there are such extras
         project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
@@ -110,13 +167,14 @@ def run_small(desk, line):
     elif program == "nil-mitsuba" and words[0] == "render":
         # Scenes of the project take their size as parameters; the README's own is small
         size = [] if "hello.xml" in words else ["-D", "resx=32", "-D", "resy=18"]
-        run(desk, [*command, *words, *size, "--spp", "2"])
+        return run(desk, [*command, *words, *size, "--spp", "2"])
     elif program == "nil-mitsuba":
-        run(desk, [*command, *words])
+        return run(desk, [*command, *words])
     elif program == "python" and words[-1] in TESTED_BY:
         name = Path(words[-1].removeprefix("benchmarks.")).stem
         assert name in (ROOT / "tests" / TESTED_BY[words[-1]]).read_text(encoding="utf-8")
     elif program == "python" and words[-1] in QUICK:
-        run(desk, [sys.executable, *words, "--quick"])
+        return run(desk, [sys.executable, *words, "--quick"])
     else:
         pytest.fail(f"no way to run {line!r} at a small size: add one")
+    return ""
