@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
+from .geometry import larger, smaller
 from .quotient import Space, opaque
 
 # Roundings of the conserved quantities, times ten: a helix that misses a box by less may meet it.
@@ -33,7 +34,7 @@ class Passage:
 
     def __init__(self, p: mi.Point3f, v: mi.Vector3f, twist: mi.Float):
         self.twist = twist
-        k, w = dr.maximum(dr.abs(twist), 1e-9), dr.abs(v.z)
+        k, w = larger(dr.abs(twist), 1e-9), dr.abs(v.z)
         c2 = dr.fma(v.x, v.x, v.y * v.y)
         c = dr.sqrt(c2)
         self.rate = twist * v.z
@@ -44,16 +45,16 @@ class Passage:
 
         # Bounds of |x''|, |y''| and of |z''|: |a b| ≤ c²/2 and |a| ≤ c
         m2 = dr.abs(self.m2)
-        self.turn = dr.maximum(k * w * c, 1e-12)
-        self.rise = dr.maximum(k * dr.fma(c, m2, c2), 1e-12)
+        self.turn = larger(k * w * c, 1e-12)
+        self.rise = larger(k * dr.fma(c, m2, c2), 1e-12)
 
         # The integral of (2 |m b| − b² − w²)/(k w²) over the half turn in which it may be positive:
         # the first bound takes the largest integrand, the second leaves w² out
-        fall = dr.pi * dr.maximum(dr.fma(0.25 * m2, m2, -w * w), 0)
-        fall = dr.select(m2 > c, dr.minimum(fall, dr.fma(2 * m2, c, -0.5 * dr.pi * c2)), fall)
-        self.dip = fall * dr.rcp(dr.maximum(k * w * w, 1e-30))
-        self.period = 2 * dr.pi / dr.maximum(k * w, 1e-12)
-        self.per_gain = dr.rcp(self.period * dr.fma(0.5 * c2, dr.rcp(dr.maximum(w, 1e-12)), w))
+        fall = dr.pi * larger(dr.fma(0.25 * m2, m2, -w * w), 0)
+        fall = dr.select(m2 > c, smaller(fall, dr.fma(2 * m2, c, -0.5 * dr.pi * c2)), fall)
+        self.dip = fall * dr.rcp(larger(k * w * w, 1e-30))
+        self.period = 2 * dr.pi / larger(k * w, 1e-12)
+        self.per_gain = dr.rcp(self.period * dr.fma(0.5 * c2, dr.rcp(larger(w, 1e-12)), w))
 
 
 class Box:
@@ -69,7 +70,8 @@ class Box:
 
     def gap(self, p: mi.Point3f) -> mi.Float:
         """No more than the distance (cells) of a point from the box; not positive inside."""
-        return dr.max(dr.maximum(self.lower - p, p - self.upper))
+        off = larger(self.lower - p, p - self.upper)
+        return larger(larger(off.x, off.y), off.z)
 
     def clearance(self, p: mi.Point3f, v: mi.Vector3f, passage: Passage) -> mi.Float:
         """Arc length (cells) for which the geodesic at ``p`` in direction ``v`` stays outside.
@@ -82,19 +84,19 @@ class Box:
         for i, most in enumerate((passage.turn, passage.turn, passage.rise)):
             # A coordinate that is off the box by g and moves away at speed u is not back as long as
             # g + u t − M t²/2 > 0, where M bounds its acceleration.
-            gap = dr.maximum(below[i], above[i])
+            gap = larger(below[i], above[i])
             away = dr.select(above[i] > 0, velocity[i], -velocity[i])
-            root = dr.sqrt(dr.maximum(dr.fma(away, away, 2 * most * gap), 0))
+            root = dr.sqrt(larger(dr.fma(away, away, 2 * most * gap), 0))
             leaving = away > 0
             back = dr.select(leaving, away + root, 2 * gap) / dr.select(leaving, most, root - away)
-            free = dr.maximum(free, dr.select(gap > 0, back, 0))
+            free = larger(free, dr.select(gap > 0, back, 0))
 
         # In the mean z moves up (down, if w < 0): away from the box it comes back only by a dip,
         # towards the box it takes so many turns.
-        gap = dr.maximum(below.z, above.z)
+        gap = larger(below.z, above.z)
         leaves = (above.z > 0) == passage.upward
-        turns = dr.floor(dr.maximum(gap - passage.dip, 0) * passage.per_gain)
-        free = dr.maximum(free, dr.select((gap > 0) & ~leaves, turns * passage.period, 0))
+        turns = dr.floor(larger(gap - passage.dip, 0) * passage.per_gain)
+        free = larger(free, dr.select((gap > 0) & ~leaves, turns * passage.period, 0))
         never = (gap > passage.dip) & (gap > 0) & leaves
         never |= self._beside(passage)
         return dr.select(never, dr.inf, SHORT * free)
@@ -109,7 +111,7 @@ class Box:
             (passage.n, self.lower.y, self.upper.y),
         ):
             low, high = rate * low, rate * high
-            low, high = dr.minimum(low, high), dr.maximum(low, high)
+            low, high = smaller(low, high), larger(low, high)
             margin = MARGIN * (1 + dr.abs(centre) + dr.abs(low) + dr.abs(high))
             beside |= (low - (centre + c) > margin) | ((centre - c) - high > margin)
         return beside

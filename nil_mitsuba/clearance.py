@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
+from .geometry import larger, smaller
 from .quotient import Space, opaque
 from .shapes import FAR, Shapes
 
@@ -127,21 +128,23 @@ class Clearance:
             # The level that holds p is the exponent of its distance from the focus
             n = FOCUS_VOXELS
             offset = p - self.focus
-            ratio = self.per_half * dr.max(dr.abs(offset))
-            bits = dr.reinterpret_array(mi.Int32, dr.maximum(ratio, 0.25)) >> 23
-            level = dr.maximum(bits - 126, self.first)
+            aside = dr.abs(offset)
+            ratio = self.per_half * larger(larger(aside.x, aside.y), aside.z)
+            bits = dr.reinterpret_array(mi.Int32, larger(ratio, 0.25)) >> 23
+            level = larger(bits - 126, self.first)
             inner = level < self.count
             # Half a level's voxels per half of its size, which is 2^level of the finest
-            scale = dr.reinterpret_array(mi.Float, (127 - dr.minimum(level, 60)) << 23)
+            scale = dr.reinterpret_array(mi.Float, (127 - smaller(level, 60)) << 23)
             scale *= 0.5 * n * self.per_half
-            voxel = mi.Vector3u(dr.clip(dr.fma(offset, scale, 0.5 * n), 0, n - 1))
+            voxel = dr.fma(offset, scale, 0.5 * n)
+            voxel = mi.Vector3u(smaller(larger(voxel, 0), n - 1))
             place = ((mi.UInt32(level) * n + voxel.z) * n + voxel.y) * n + voxel.x
             index = dr.select(inner, self.base + place, index)
         inside = dr.gather(mi.Float, self.table, index, active)
         # What lies in the box is seen from p at no less than a right angle over its nearest point
-        outside = dr.squared_norm(p - dr.clip(p, self.lower, self.upper))
+        outside = dr.squared_norm(p - smaller(larger(p, self.lower), self.upper))
         distance = SHORT * dr.sqrt(dr.fma(inside, inside, outside)) - self.slack
-        return dr.select((outside > 0) & ~inner, dr.maximum(distance, 0), inside)
+        return dr.select((outside > 0) & ~inner, larger(distance, 0), inside)
 
     def leap(self, p: mi.Point3f, v: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
         """Arc length (cells) for which the geodesic from ``p`` along ``v`` meets nothing.
@@ -181,7 +184,7 @@ class _Grid:
 
     def index(self, p: mi.Point3f) -> mi.UInt32:
         """The voxel that holds ``p`` (cells), or the closest one."""
-        return dr.dot(mi.Vector3u(dr.clip(self._to_voxels(p), 0, self.last)), self.stride)
+        return dr.dot(mi.Vector3u(smaller(larger(self._to_voxels(p), 0), self.last)), self.stride)
 
     def places(self) -> mi.Vector3i:
         """Each voxel's place in the grid."""

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from .geometry import larger, smaller
+
 Vector = TypeVar("Vector", bound=Any)  # any of Mitsuba's types with three components
 
 
@@ -109,7 +111,7 @@ def exit_through_face(p: mi.Point3f, d: mi.Vector3f, space: Space) -> tuple[mi.F
         dr.select(d[i] == 0, inf, (dr.select(d[i] > 0, space.periods[i], 0) - p[i]) / d[i])
         for i in range(3)
     ]
-    nearest = dr.minimum(s[0], dr.minimum(s[1], s[2]))
+    nearest = smaller(s[0], smaller(s[1], s[2]))
     on_x = s[0] == nearest
     on_y = ~on_x & (s[1] == nearest)
     on_z = ~on_x & ~on_y
@@ -119,7 +121,7 @@ def exit_through_face(p: mi.Point3f, d: mi.Vector3f, space: Space) -> tuple[mi.F
             for i, on in enumerate((on_x, on_y, on_z))
         )
     )
-    return dr.maximum(nearest, 0), face
+    return larger(0, nearest), face  # what is not a number stays so
 
 
 def through_face(

@@ -80,6 +80,26 @@ def test_a_shadow_ray_ends_at_a_light_thousands_of_cells_away(rgb):
         assert blocked[0] == expected
 
 
+def test_chords_are_as_far_inside_of_the_curve_as_outside(rgb):
+    """In the mean of all first chords, in sagittas of a chord of length 1, on a parabola."""
+    from nil_mitsuba.tracer import CORNER, STEEPEST
+
+    def offset(x, first):
+        """Inwards, where the first corner is at ``first``, at x from the start."""
+        corner = CORNER * min(1, STEEPEST * first) ** 2
+        if x < first:
+            return 4 * x * (first - x) - corner * x / first
+        along = (x - first) % 1
+        behind = corner if x < first + 1 else CORNER
+        return 4 * along * (1 - along) - behind * (1 - along) - CORNER * along
+
+    firsts = [(i + 0.5) / 200 for i in range(200)]
+    means = [sum(offset((j + 0.5) / 100, u) for u in firsts) / 200 for j in range(300)]
+    assert max(map(abs, means)) <= 0.11
+    # Wherever the first corner was, all phases are alike behind the second
+    assert max(map(abs, means[200:])) <= 1e-3
+
+
 def check_that_rays_end(mi, p, v, twist):
     """Each ray ends by a hit within the cube or at ``max_distance``, with finite values."""
     from nil_mitsuba.interaction import surface_interaction
@@ -144,3 +164,21 @@ def test_ten_million_random_rays_end(rgb, twist):
             mi.Point2f(random.next_float32(), random.next_float32())
         )
         check_that_rays_end(mi, p, v, twist)
+
+
+@pytest.mark.parametrize("quotient", [False, True])
+def test_rays_that_are_not_numbers_end(rgb, quotient):
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Cone, Tracer
+
+    mi = rgb
+    scene = mi.load_dict({"type": "scene", **truth.to_mitsuba(truth.cell_scene(), mi)})
+    tracer = Tracer(scene, Space(1, quotient, [0, 0, 0], 1.0), 12.0 if quotient else dr.inf)
+    nan = dr.nan
+    p = mi.Point3f([nan, 0.5, 0.5, 0.5, nan], [0.1, nan, 0.1, 0.1, nan], [0.2] * 5)
+    v = mi.Vector3f([0.6, 0.6, nan, 0.6, nan], [0.8, 0.8, 0.8, nan, nan], [0] * 5)
+    reach = tracer.reach(p, v)
+    hit = tracer.intersect(p, v, Cone(0, 3e-4), reach, mi.Bool(True))
+    assert dr.none(hit.valid)
+    blocked = tracer.occluded(p, p, v, Cone(0, 3e-4), reach, mi.Bool(True))
+    assert dr.none(blocked)
