@@ -416,7 +416,7 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
     target = aiming.middle_of(opened.scene, at) if isinstance(at, str) else at
     up = up or aiming.up_of(before)
     origin = origin or aiming.columns_of(before)[3]
-    found = aiming.look_at(opened.integrator, origin, target, up, image)
+    found = aiming.look_at(opened.nil, origin, target, up, image)
     click.echo(aiming.as_xml(found, up, camera))
 
 

@@ -51,12 +51,14 @@ class Opened(NamedTuple):
     """A job's scene and integrator, loaded.
 
     ``job`` is the job with all that loading has found out: it opens to the same scene, or not at
-    all. ``layers`` are those that were asked for, which denoising may have added to.
+    all. ``nil`` is the integrator, or what that wraps. ``layers`` are those that were asked for,
+    which denoising may have added to.
     """
 
     job: Job
     scene: mi.Scene
     integrator: mi.Integrator
+    nil: mi.Integrator
     layers: tuple[str, ...]
 
     def still(self, rules: Rules) -> Still:
@@ -103,12 +105,12 @@ def open_scene(
             )
         further: dict[str, str] = {}
         if job.fit:
-            fitted = fit(scene, sensors[job.sensor], integrator, job.fit)
+            fitted = fit(scene, sensors[job.sensor], files.nil(), job.fit)
             further |= fitted.properties
             for sentence in fitted.notes:
                 note(sentence)
         elif foreign and not CELL & job.properties.keys():
-            advice = unfitted(scene, sensors[job.sensor], integrator)
+            advice = unfitted(scene, sensors[job.sensor], files.nil())
             if advice:
                 note(f"{job.path}: {advice}")
         if job.denoise:
@@ -116,7 +118,7 @@ def open_scene(
         if further:
             integrator = files.integrator(**further)
     job = replace(job, properties=job.properties | further, scene_hash=scene_hash, fit=None)
-    return Opened(job, scene, integrator, layers)
+    return Opened(job, scene, integrator, files.nil(), layers)
 
 
 def open_still(job: Job) -> Still:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from .parameters import NAMES
+
 # The options that a scene's own integrator shares with "nil": they survive its replacement.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 
@@ -64,6 +66,11 @@ class SceneFiles:
         # A copy, since references become the objects that are made
         copy = mi.parser.ParserState(self.alone)
         return mi.parser.instantiate(self.config, copy).integrator()
+
+    def nil(self):
+        """The integrator "nil" itself, which a wrapper may hold."""
+        given = {name: self._nil.props[name] for name in NAMES if name in self._nil.props}
+        return mi.load_dict({"type": "nil"} | given)
 
     def use_box_filter(self) -> None:
         """Let each pixel hold its own samples only, as denoising needs; says so in `notes`."""

@@ -48,6 +48,20 @@ def job(tmp_path, rgb):
     )
 
 
+def test_a_cell_is_fitted_for_what_a_wrapper_holds(job):
+    """Plain Nil within another integrator is fitted as plain Nil."""
+    path = pathlib.Path(job.path)
+    nil = '<integrator type="nil"><boolean name="quotient" value="false"/></integrator>'
+    cells = []
+    for integrator in (nil, f'<integrator type="moment">{nil}</integrator>'):
+        path.write_text(SCENE.replace('<integrator type="nil"/>', integrator))
+        notes = []
+        opened = jobs.open_scene(replace(job, denoise=False, properties={}), notes.append)
+        assert not opened.nil.quotient and not any("carried" in sentence for sentence in notes)
+        cells.append(opened.job.properties["cell_origin"])
+    assert cells[0] == cells[1]
+
+
 def test_what_a_job_opens_to_is_what_its_workers_open(job):
     opened = jobs.open_scene(job)
     here = opened.still(stills.Rules(spp=8))
