@@ -100,8 +100,8 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
             notes.append(
                 f"--fit: in flat space the camera looks at {_text(target)}, which is seen "
                 f'{angle:.0f} degrees off the middle now: unless it is aimed, "nil-mitsuba aim" '
-                f"with the options of this command and --at {_text(target, ',')[1:-1]} prints the "
-                "to_world that looks there."
+                f"with the -D, -P, -s and --fit of this command and --at "
+                f"{_text(target, ',')[1:-1]} prints the to_world that looks there."
             )
     return Fit(properties, notes, options)
 

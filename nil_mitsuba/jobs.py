@@ -105,6 +105,12 @@ def open_scene(
             )
         further: dict[str, str] = {}
         if job.fit:
+            chosen = sorted(CELL & job.properties.keys())
+            if chosen:
+                raise ValueError(
+                    f"--fit finds cell_size and cell_origin itself, and -P gives {chosen[0]}: give "
+                    "one of the two."
+                )
             fitted = fit(scene, sensors[job.sensor], files.nil(), job.fit)
             further |= fitted.properties
             for sentence in fitted.notes:

@@ -62,6 +62,11 @@ def test_a_cell_is_fitted_for_what_a_wrapper_holds(job):
     assert cells[0] == cells[1]
 
 
+def test_a_cell_is_not_fitted_and_given(job):
+    with pytest.raises(ValueError, match="-P gives cell_size: give one of the two"):
+        jobs.open_scene(replace(job, properties={"cell_size": "3"}))
+
+
 def test_what_a_job_opens_to_is_what_its_workers_open(job):
     opened = jobs.open_scene(job)
     here = opened.still(stills.Rules(spp=8))
