@@ -39,8 +39,8 @@ START = 0.4
 # as likely, is then right in the mean from its start on, to a twentieth of a sagitta: with τ of a
 # chord behind, off by 4/3 τ − 2 τ² + 2/3 τ³ + 2/3 τ log τ. A shorter one does not reach that far
 # out, or grazing rays would meet what they leave: no farther than chords so many times as long do.
-# First chords from a half to three halves save half a query a ray and are as right in the mean, but
-# the long ones start towards what they leave: 0.4 % of the light of a furnished cell.
+# First chords from a half to three halves of one would save half a query a ray, but the long ones
+# start towards what they leave, and that shows in benchmarks/accuracy.py's furnished cell.
 CORNER, STEEPEST = 2 / 3, 4
 # Leaps are worth it down to this part of a chord: each takes 8 to 12 ns, where a query takes 50.
 LEAST_LEAP = 0.25
@@ -110,9 +110,8 @@ class Front:
 
 @dataclass
 class Chord:
-    """A chord of the arc's ``length`` (cells), from ``start`` on by ``along`` (cells)."""
+    """A chord of the arc's ``length`` (cells), by ``along`` (cells) from where the ray has come."""
 
-    start: mi.Point3f
     along: mi.Vector3f
     length: mi.Float
 
@@ -304,14 +303,16 @@ class Tracer:
         length = (front.t + length) - front.t
         foot = front.foot.moved(length, self.space.twist)
         end = dr.fma(lift, self.acceleration(foot), foot.point)
-        return Chord(front.vertex, mi.Vector3f(end - front.vertex), length), foot
+        return Chord(mi.Vector3f(end - front.vertex), length), foot
 
-    def _ray(self, chord: Chord, before: mi.Float, last: mi.Float, time: mi.Float) -> mi.Ray3f:
+    def _ray(
+        self, front: Front, chord: Chord, before: mi.Float, last: mi.Float, time: mi.Float
+    ) -> mi.Ray3f:
         """The ray (scene) along a chord from ``before`` it to ``last``, in the arc's lengths
         (cells), which are those of the scene but for the chord's own shear and sagitta."""
         d = chord.along / larger(chord.length, 1e-30)
         space = self.space
-        o = space.to_scene(dr.fma(-before, d, chord.start))
+        o = space.to_scene(dr.fma(-before, d, front.vertex))
         return line_ray(o, space.to_scene_axes(d), time, (before + last) * space.size)
 
     @dr.syntax
@@ -342,11 +343,11 @@ class Tracer:
         s = dr.fma(found.t, self.space.cells_per_unit, -before)
         return smaller(larger(s, 0), chord.length)
 
-    def _exit(self, chord: Chord) -> tuple[mi.Float, mi.Vector3i]:
+    def _exit(self, front: Front, chord: Chord) -> tuple[mi.Float, mi.Vector3i]:
         """What part of a chord lies in this cell, and through which face it leaves."""
         if not self.space.quotient:
             return mi.Float(1), mi.Vector3i(0)
-        part, face = exit_through_face(chord.start, chord.along, self.space)
+        part, face = exit_through_face(front.vertex, chord.along, self.space)
         return smaller(part, 1), dr.select(part < 1, face, 0)
 
     def _onward(
@@ -368,7 +369,7 @@ class Tracer:
         if space.quotient:
             t = front.t + s
             foot = foot.moved((t - front.t) - chord.length, space.twist)
-            vertex = dr.fma(chord.along, part, chord.start)
+            vertex = dr.fma(chord.along, part, front.vertex)
             face = dr.select(hit, 0, face)
             vertex, (point,), cell = through_face(vertex, [foot.point], cell, face, space)
             if leaps is not None:
@@ -376,7 +377,7 @@ class Tracer:
             foot = Foot(point, foot.direction, foot.lost)
         else:
             t = front.t + chord.length
-            vertex = mi.Point3f(chord.start + chord.along)
+            vertex = mi.Point3f(front.vertex + chord.along)
         vertex = dr.select(hit, front.vertex, vertex)
         return Front(vertex, foot, dr.select(hit, front.t, t), cell)
 
@@ -425,7 +426,7 @@ class Tracer:
         chords = Chords(v, k, cone, part, dr.select(cone.soft, 0, START), self.least)
         unit = random_of(p, v)
         front = self._start(p, p, v)
-        chord = Chord(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
+        chord = Chord(mi.Vector3f(0), mi.Float(0))
         found = dr.zeros(mi.PreliminaryIntersection3f)
         active = active & (reach > 0)
 
@@ -454,12 +455,14 @@ class Tracer:
                     querying &= ~leaps
                 length = smaller(length, reach - front.t)
                 chord, foot = self._ahead(front, length, lift)
-                part, face = self._exit(chord)
+                part, face = self._exit(front, chord)
                 if dr.hint(leaps is not None, mode="scalar"):
                     part, face = dr.select(leaps, 1, part), dr.select(leaps, 0, face)
                 # Pieces overlap by the rounding of their joint, but none reaches behind the start
                 before = dr.select(front.t > 0, self.overlap, 0)
-                ray = self._ray(chord, before, dr.fma(part, chord.length, self.overlap), time)
+                ray = self._ray(
+                    front, chord, before, dr.fma(part, chord.length, self.overlap), time
+                )
                 found = scene.ray_intersect_preliminary(ray, coherent=False, active=querying)
                 hit = found.is_valid()
                 s = dr.select(hit, self._passed(chord, found, before), part * chord.length)
@@ -475,7 +478,7 @@ class Tracer:
                 foot = front.foot
                 if not quotient:
                     foot = foot.moved(s - chord.length, k)
-                ray = self._ray(chord, before, 0, time)
+                ray = self._ray(front, chord, before, 0, time)
                 speed = dr.norm(ray.d)
                 o, d, found.t = ray.o, ray.d / speed, found.t * speed
                 distance = front.t + s
@@ -623,11 +626,11 @@ class Tracer:
                 rest = smaller(length, left - length)
                 lift = dr.select(last, 0, corner(smaller(h, STEEPEST * rest)))
                 chord, foot = self._ahead(front, length, lift)
-                part, face = self._exit(chord)
+                part, face = self._exit(front, chord)
                 last &= part >= 1
                 s = part * chord.length
                 before = dr.select(front.t > 0, self.overlap, 0)
-                ray = self._ray(chord, before, s + dr.select(last, 0, self.overlap), time)
+                ray = self._ray(front, chord, before, s + dr.select(last, 0, self.overlap), time)
                 hit = scene.ray_test(ray, coherent=False, active=searching)
                 blocked |= hit
                 front = self._onward(front, chord, foot, part, s, face, hit)
