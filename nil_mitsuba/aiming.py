@@ -41,7 +41,8 @@ def look_at(
 ) -> Aim:
     """The transform of a camera whose central geodesic meets a target, and how far that is.
 
-    ``integrator_or_scene``: an integrator "nil", or a scene that has one; it says how space bends.
+    ``integrator_or_scene``: an integrator "nil", one that holds it ("moment", "aov"), or a scene
+    that has such a one; it says how space bends.
     ``origin``, ``target``: points in scene coordinates. ``up``: the direction that is to be upright
     in the picture, along the fibres if None. ``image``: in the quotient, the cell in which the
     target's image is meant, a deck element in the order of the layer "cell"; (0, 0, 0) is the
@@ -53,14 +54,7 @@ def look_at(
     the camera, in which ``up`` is given, too. Raises ValueError if the target is at the camera or
     beyond ``max_distance``, if ``up`` is parallel to the view, or if there are no images.
     """
-    nil = integrator_or_scene
-    if isinstance(nil, mi.Scene):
-        nil = nil.integrator()
-    if not hasattr(nil, "view"):
-        raise ValueError(
-            f'look_at needs an integrator "nil", or a scene that has one, and this is '
-            f'{type(nil).__name__}: pass one such as mi.load_dict({{"type": "nil"}}).'
-        )
+    nil = _nil_of(integrator_or_scene)
     origin, target = _triple("origin", origin), _triple("target", target)
     image = _cell(image)
     if any(image) and not nil.quotient:
@@ -151,6 +145,19 @@ def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:
     if "near_clip" in mi.traverse(sensor):  # Mitsuba's other sensors refuse a focus
         text += f'\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
     return text
+
+
+def _nil_of(holder):
+    """The integrator "nil" in a scene, or that which an integrator is or wraps."""
+    outer = holder.integrator() if isinstance(holder, mi.Scene) else holder
+    within = mi.traverse(outer).hierarchy if isinstance(outer, mi.Integrator) else ()
+    found = next((node for node in within if hasattr(node, "view")), None)
+    if found is None:
+        raise ValueError(
+            f'look_at needs an integrator "nil", or a scene that has one, and this is '
+            f'{type(outer).__name__}: pass one such as mi.load_dict({{"type": "nil"}}).'
+        )
+    return found
 
 
 def _upright(view, up):

@@ -153,6 +153,18 @@ def test_a_scene_is_as_good_as_its_integrator(rgb):
     assert look_at(scene, *points).focus_distance == look_at(integrator, EYE, TARGET).focus_distance
 
 
+def test_an_integrator_is_aimed_for_that_holds_nil(rgb):
+    bent = {"type": "nil", "twist": 2}
+    layers = {"type": "aov", "aovs": "d:depth", "within": bent}
+    expected = look_at(mi.load_dict(bent), EYE, TARGET)
+    for holder in (layers, {"type": "moment", "within": layers}):
+        integrator = mi.load_dict(holder)
+        for given in (integrator, mi.load_dict({"type": "scene", "around": integrator})):
+            found = look_at(given, EYE, TARGET)
+            assert found.focus_distance == expected.focus_distance
+            assert dr.all(found.to_world.matrix == expected.to_world.matrix, axis=None)
+
+
 @pytest.mark.parametrize(
     "parameters, arguments, sentence",
     [
