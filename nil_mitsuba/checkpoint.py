@@ -40,7 +40,7 @@ class Checkpoint:
     ``settings`` is what has to be equal for sums to be added up (names, texts, numbers, and lists
     and dictionaries of them); ``seconds`` the time that rendering took;
     ``about`` what a picture's metadata tell besides; ``noise`` the estimate of ``stills.noise``,
-    None where there is none or no one has made it, as after an addition.
+    None where there is none or no one has made it, as after an addition to other passes.
     """
 
     settings: dict
@@ -53,7 +53,11 @@ class Checkpoint:
         """Both together; raises ValueError if they do not belong together or overlap."""
         self.require(other.settings)
         return Checkpoint(
-            self.settings, self.sums.plus(other.sums), self.seconds + other.seconds, self.about
+            self.settings,
+            self.sums.plus(other.sums),
+            self.seconds + other.seconds,
+            self.about,
+            None if self.sums.passes else other.noise,
         )
 
     def require(self, settings: dict) -> None:

@@ -462,7 +462,8 @@ def merge(parts, output, **picture):
     # All that it took, line by line as in a script
     commands.append(shlex.join(["nil-mitsuba", *sys.argv[1:]]))
     state.about["commandLine"] = "\n".join(dict.fromkeys(filter(None, commands)))
-    if film["pixel_format"]:  # as pictures have that parts can be merged to
+    # As pictures have that parts can be merged to
+    if film["pixel_format"] and state.noise is None:
         state.noise = stills.noise(stills.film_of(film), state.sums)
     if sums_only:
         checkpoint.save(exr_path, state)
@@ -734,7 +735,8 @@ def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
     """What is said of a still that is done."""
     spp = state.settings["pass_spp"]
     advice = ""
-    if state.sums.count == 1 == state.about.get("count", 1) and spp > 1:  # the whole picture
+    whole = state.sums.count == 1 == state.about.get("count", 1)
+    if whole and state.noise is None and spp > 1:
         advice = f" (--pass-spp {math.ceil(spp / stills.NOISE_PASSES)} makes more)"
     return f"{_how_far(state, denoised)}{advice}."
 

@@ -17,7 +17,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 from .camera import Camera
 from .errors import raising_causes
 from .layers import LAYERS, channel_names
-from .sums import Sums, develop, luminance
+from .sums import LUMINANCE, Sums, develop, luminance, plane
 
 # Camera samples in one pass (or one per pixel), and in one wavefront, which is what is traced at
 # once: more use no processor better, and memory grows with them.
@@ -51,6 +51,8 @@ class Passes:
     is less, but at least one per pixel. It is rendered in wavefronts; with the sampler
     "independent" each sample has a seed of its own, so that it does not matter where they are cut.
     ``general``: at the twist 0, too, the kernels of other twists, for who changes it while looking.
+    ``judged``: if there is one pass only, what its halves differ by is summed up, too, where they
+    are independent and the film holds colours.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Passes:
         spp: int = 0,
         pass_spp: int | None = None,
         general: bool = False,
+        judged: bool = False,
     ):
         self.integrator = integrator
         self.scene = scene
@@ -87,6 +90,8 @@ class Passes:
         self.sampler.set_samples_per_wavefront(self.spp)
         self.count = math.ceil(wanted / self.spp)
         self.samples = pixels * self.spp  # Of a pass
+        special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
+        self.halved = judged and self.count == 1 < self.spp and self.own_seeds and not special
 
         pace = _paces.get(integrator)
         self.wavefront = samples_in_time(pace) if pace else FIRST_SAMPLES  # in the next one
@@ -126,7 +131,8 @@ class Passes:
             crop = self.film.crop_size()
             depth = len(channel_names(self.layers, "first"))
             points = dr.zeros(mi.Int32, crop.y * crop.x * depth)
-            self._render_wavefronts(block, points, index)
+            halves = self._block_of_halves(block) if self.halved else None
+            self._render_wavefronts(block, points, index, halves)
             # Double precision only while they are added: a third of the memory
             values = block.tensor()
             return Sums(
@@ -134,6 +140,7 @@ class Passes:
                 self._moments(values),
                 mi.TensorXi(points, (crop.y, crop.x, depth)),
                 ((index, index + 1),),
+                self._enlarged(halves.tensor()) if halves else None,
             )
 
     def develop(self, sums: Sums) -> mi.TensorXf:
@@ -150,8 +157,28 @@ class Passes:
             dr.concat([dr.square(total), total * weight, dr.square(weight)]), (3, crop.y, crop.x)
         )
 
-    def _render_wavefronts(self, block, points, index):
-        # Added to `block`; the layers of a pixel's first sample to `points`
+    def _block_of_halves(self, block):
+        # Of luminance and weight, negative in one half. Channels more in the film's own block would
+        # have it summed up in another order, and pictures of one pass differ from others' first.
+        return mi.ImageBlock(
+            block.size(),
+            block.offset(),
+            2,
+            block.rfilter(),
+            block.has_border(),
+            coalesce=block.coalesce(),
+        )
+
+    def _enlarged(self, differences):
+        # Their means differ by a variance that goes with 1/a + 1/b, that of halves with 4/(a + b)
+        a, b = self.spp // 2, self.spp - self.spp // 2
+        scale = self.spp / (2 * math.sqrt(a * b))
+        height, width, count = differences.shape
+        planes = [scale * plane(differences, i) for i in range(count)]
+        return mi.TensorXd(dr.concat(planes), (count, height, width))
+
+    def _render_wavefronts(self, block, points, index, halves):
+        # Added to `block` and `halves`; the layers of a pixel's first sample to `points`
         self.begun, self.done, lanes = perf_counter(), 0, 0
         start = self.begun
         try:
@@ -163,10 +190,10 @@ class Passes:
                     add, lanes_of_next = self._record(index, self.done + lanes)
                 self._finish(lanes, start)
                 start, lanes = perf_counter(), lanes_of_next
-                add(block, points)
+                add(block, points, halves)
                 del add  # what it has needs not be kept
                 # Together: what is evaluated later would be traced again
-                dr.eval(block.tensor(), points)
+                dr.eval(block.tensor(), points, halves.tensor() if halves else None)
             self._finish(lanes, start)
         except BaseException:
             # Nothing that was scattered or begun outlives the scene
@@ -208,13 +235,17 @@ class Passes:
         start = self.camera.start(ray, across)
         radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, inside)
 
-        def add(block, points):
+        def add(block, points, halves):
+            value, one = dr.select(inside, radiance * weight, 0), dr.select(inside, mi.Float(1), 0)
+            if halves:
+                sign = dr.select((sample % spp) & 1 == 1, -one, one)
+                halves.put(position, [sign * _luminance(value, ray.wavelengths), sign])
             ADIntegrator._splat_to_block(
                 block,
                 self.film,
                 position,
-                value=dr.select(inside, radiance * weight, 0),
-                weight=dr.select(inside, mi.Float(1), 0),
+                value=value,
+                weight=one,
                 alpha=dr.select(valid & inside, mi.Float(1), 0),
                 aovs=self._channels(seen, "mean"),
                 wavelengths=ray.wavelengths,
@@ -266,6 +297,15 @@ class Passes:
             if LAYERS[layer].rule == rule
             for channel in seen[layer]
         ]
+
+
+def _luminance(value, wavelengths):
+    """That of the colour which Mitsuba adds to a film."""
+    if mi.is_spectral:
+        value = mi.spectrum_to_srgb(value, wavelengths)
+    elif mi.is_monochromatic:
+        value = mi.Color3f(value.x)
+    return sum(c * channel for c, channel in zip(LUMINANCE, value, strict=True))
 
 
 def samples_in_time(pace: float) -> int:

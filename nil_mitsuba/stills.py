@@ -70,7 +70,8 @@ class Rules:
 @dataclass(frozen=True)
 class Progress:
     """How far a still is: passes, samples per pixel, seconds of rendering, and the noise so far
-    (None before the second pass); ``rules`` are those that will end it."""
+    (None before the second pass, unless one is all there will be); ``rules`` are those that will
+    end it."""
 
     passes: int
     samples: int
@@ -140,7 +141,10 @@ class Still:
         if pass_spp is None and (rules.seconds or rules.noise):
             pass_spp = max(1, LOOK_SAMPLES // dr.prod(self.film.crop_size()))
             pass_spp = min(pass_spp, rules.spp or pass_spp)
-        self.passes = Passes(integrator, scene, sensor, seed, rules.spp or 0, pass_spp)
+        judged = rules.spp is not None or rules == Rules()  # no other rule makes more passes
+        self.passes = Passes(
+            integrator, scene, sensor, seed, rules.spp or 0, pass_spp, judged=judged
+        )
         if rules == Rules():
             rules = Rules(spp=self.passes.count * self.passes.spp)
         self.rules = rules
@@ -174,7 +178,8 @@ class Still:
         """Pass number ``index``."""
         start = time.perf_counter()
         sums = self.passes.render(index)
-        return Checkpoint(self.settings, sums, time.perf_counter() - start)
+        own_noise = noise(self.film, sums)
+        return Checkpoint(self.settings, sums, time.perf_counter() - start, noise=own_noise)
 
     def start(self, path: str | os.PathLike | None, resume: bool) -> Checkpoint:
         """What there is to go on with: nothing, or with ``resume`` the checkpoint at `path`.
@@ -221,7 +226,8 @@ class Still:
         """
         parts = iter(parts)
         before, start = state.seconds, time.perf_counter()
-        state.noise = noise(self.film, state.sums)
+        if state.noise is None:
+            state.noise = noise(self.film, state.sums)
         with interruption() as signals:
             while True:
                 state.seconds = before + time.perf_counter() - start
@@ -246,7 +252,8 @@ class Still:
                 if part is None:
                     break
                 state = state.plus(part)
-                state.noise = noise(self.film, state.sums)
+                if state.noise is None:
+                    state.noise = noise(self.film, state.sums)
                 state.seconds = before + time.perf_counter() - start  # As on a clock on the wall
                 if saver is not None:
                     saver.after_pass(state)
@@ -348,35 +355,44 @@ def render(
 def noise(film: mi.Film, sums: Sums) -> float | None:
     """Root mean square, over all pixels, of the standard error of a pixel's luminance as a fraction
     of that luminance or of the image's mean luminance, whichever is larger: a number without a
-    unit, 0.02 being two percent; None below two passes.
+    unit, 0.02 being two percent; None below two passes, or for one without ``halves``.
 
-    It is estimated from what the passes differ by, and is that of the image as rendered: denoised,
-    an image has another error, of which this says nothing. A single pixel counts 1 at most, so
-    that a few bright specks do not hide how far the rest is. Pixels that are infinite or not a
-    number, which no further samples mend, are left out; the error of an image that has no others
-    is infinite, and that of a black one, in which no sample has found light, 0.
+    It is estimated from what the passes differ by, or the halves of a single one, and is that of
+    the image as rendered: denoised, an image has another error, of which this says nothing. A
+    single pixel counts 1 at most, so that a few bright specks do not hide how far the rest is.
+    Pixels that are infinite or not a number, which no further samples mend, are left out; the error
+    of an image that has no others is infinite, and that of a black one, in which no sample has
+    found light, 0.
 
     A pixel's luminance is the ratio R = ΣS/ΣW of sums over n passes; the variance of such a ratio
-    is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13).
+    is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13); with two
+    halves, whose sums differ by D and V, it is (D − R V)² / (ΣW)².
     """
+    if sums.count < 2 and sums.halves is None:
+        return None
     total, weight = luminance(film, sums.values)
     pixels = len(weight)
-    ss, sw, ww = (
-        dr.gather(mi.Float64, sums.moments.array, dr.arange(mi.UInt32, pixels) + i * pixels)
-        for i in range(3)
-    )
+
+    def plane_of(tensor, i):
+        return dr.gather(mi.Float64, tensor.array, dr.arange(mi.UInt32, pixels) + i * pixels)
+
+    ss, sw, ww = (plane_of(sums.moments, i) for i in range(3))
     n = dr.opaque(mi.Float64, sums.count)
     finite = dr.isfinite(total) & dr.isfinite(ss) & dr.isfinite(weight)
     seen = (weight > 0) & finite
     ratio = dr.select(seen, total / weight, 0)
     size = dr.abs(ratio)  # filters with negative lobes make pixels below black
     count = dr.maximum(dr.count(finite), 1)
-    residuals = dr.fma(-2 * ratio, sw, ss) + dr.square(ratio) * ww
-    variance = dr.maximum(residuals, 0) / dr.square(weight) * n / (n - 1)
+    if sums.halves is not None:
+        difference, unequal = (plane_of(sums.halves, i) for i in range(2))
+        residuals = dr.square(difference - ratio * unequal)
+    else:
+        residuals = dr.fma(-2 * ratio, sw, ss) + dr.square(ratio) * ww
+        residuals *= n / (n - 1)
+    variance = dr.maximum(residuals, 0) / dr.square(weight)
     scale = dr.maximum(size, dr.sum(size) / count)
     squares = dr.select(seen & (scale > 0), variance / dr.square(scale), 0)
-    result = dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
-    return result if sums.count > 1 else None
+    return dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
 
 
 @contextlib.contextmanager

@@ -22,13 +22,16 @@ class Sums:
     TensorXd, 3 × height × width, sums over passes of S², S·W and W², where S is the sum of weighted
     luminances in a pixel of one pass and W that of the weights; ``points``: TensorXi, height ×
     width × channels of the layers that show a pixel's first sample; ``passes``: ranges (first,
-    stop) of the passes that are in, sorted.
+    stop) of the passes that are in, sorted. ``halves``: of a single pass alone, and only if asked
+    for, TensorXd, 2 × height × width: by how much S and W differ between its two halves, enlarged
+    as far as those are not of one size.
     """
 
     values: mi.TensorXd
     moments: mi.TensorXd
     points: mi.TensorXi
     passes: tuple[tuple[int, int], ...]
+    halves: mi.TensorXd | None = None
 
     @property
     def count(self) -> int:
@@ -71,12 +74,12 @@ def name_passes(ranges: Iterable[tuple[int, int]]) -> str:
 
 def name_noise(noise: float | None, passes: int) -> str:
     """What ``stills.noise`` says of so many passes, or why it says nothing."""
-    if passes < 2:
+    if noise is None and passes < 2:
         return f"not estimated: {'one pass' if passes else 'no passes'}"
     if noise is None:
         return "not stated"
     if noise == 0:  # A black picture, too, of which one can say no more
-        return "0: all passes are equal"
+        return f"0: {'all passes' if passes > 1 else 'both halves of the pass'} are equal"
     return "infinite: no pixel is finite" if noise == math.inf else f"{noise:.3g}"
 
 
@@ -98,10 +101,9 @@ def develop(film: mi.Film, layers: Iterable[str], sums: Sums, pass_spp: int) -> 
 def luminance(film: mi.Film, values: mi.TensorXf | mi.TensorXd) -> tuple[mi.Float64, mi.Float64]:
     """Sums of luminances and of weights by pixel, out of the channels that a film sums up."""
     channels = values.shape[2]
-    pixel = dr.arange(mi.UInt32, values.shape[0] * values.shape[1]) * channels
 
     def channel(i):
-        return mi.Float64(dr.gather(type(values.array), values.array, pixel + i))
+        return plane(values, i)
 
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         # Bands of its own, none more important than another; the last channel is the weight
@@ -111,3 +113,10 @@ def luminance(film: mi.Film, values: mi.TensorXf | mi.TensorXd) -> tuple[mi.Floa
         weight = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
         colours = LUMINANCE
     return sum(c * channel(i) for i, c in enumerate(colours)), channel(weight)
+
+
+def plane(values: mi.TensorXf | mi.TensorXd, channel: int) -> mi.Float64:
+    """A channel of an image, height × width × channels, by pixel."""
+    height, width, channels = values.shape
+    pixel = dr.arange(mi.UInt32, height * width) * channels
+    return mi.Float64(dr.gather(type(values.array), values.array, pixel + channel))

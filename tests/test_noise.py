@@ -63,14 +63,35 @@ def test_parts_in_one_file_tell_their_noise(command):
     assert float(told(command, "both.sums")) > 0
 
 
-def test_one_pass_has_no_noise_and_says_how_to_have_it(command):
+def test_a_picture_of_one_pass_tells_the_noise_that_its_halves_show(command):
+    whole = ("render", "scene.xml", "--spp", "16", "--checkpoint", "a.sums")
+    _, _, err = command(*whole)
+    noise = stated()
+    assert 0.001 < noise < 1
+    assert err == f"16 samples per pixel, noise {noise:.3g}.\n"
+    assert told(command) == told(command, "a.sums") == f"{noise:.3g}"
+    command("merge", "a.sums", "-o", "merged.exr")
+    assert told(command, "merged.exr") == f"{noise:.3g}"
+    # Resumed with nothing to do; and with more passes, which are judged as ever
+    assert command(*whole, "--resume")[2] == err
+    command("render", "scene.xml", "--spp", "32", "--checkpoint", "a.sums", "--resume")
+    assert 0 < stated() < noise
+
+
+def test_one_sample_has_no_noise(command):
+    _, _, err = command("render", "scene.xml", "--spp", "1")
+    assert err == "1 sample per pixel, noise not estimated: one pass.\n"
+    assert stated() == told(command) == "not estimated: one pass"
+
+
+def test_a_pass_whose_samples_depend_on_each_other_says_how_to_have_an_estimate(command, folder):
+    stratified = SENSOR.replace("independent", "stratified")
+    assert stratified != SENSOR
+    (folder / "scene.xml").write_text(scene(NIL, stratified, LAMP))
     _, _, err = command("render", "scene.xml", "--spp", "16")
     assert err == (
         "16 samples per pixel, noise not estimated: one pass (--pass-spp 4 makes more).\n"
     )
-    assert stated() == told(command) == "not estimated: one pass"
-    _, _, err = command("render", "scene.xml", "--spp", "1")
-    assert err == "1 sample per pixel, noise not estimated: one pass.\n"
 
 
 def test_what_is_rendered_in_one_go_says_that_there_is_no_estimate(command, folder):

@@ -49,17 +49,23 @@ def test_time_left_is_that_of_the_nearest_rule():
 
 
 @pytest.mark.parametrize(
-    "rfilter, spp",
-    [("box", 64), ("box", 32), pytest.param("gaussian", 64, marks=pytest.mark.verify)],
+    "rfilter, spp, pass_spp",
+    [
+        ("box", 64, 16),
+        ("box", 32, 16),
+        ("box", 31, 31),
+        pytest.param("gaussian", 64, 16, marks=pytest.mark.verify),
+        pytest.param("gaussian", 64, 64, marks=pytest.mark.verify),
+    ],
 )
-def test_noise_is_the_spread_of_renders_with_other_seeds(rgb, rfilter, spp):
+def test_noise_is_the_spread_of_renders_with_other_seeds(rgb, rfilter, spp, pass_spp):
     # Each of 48 renders differs from their mean as it says that it does: the squares agree within
     # 25 %, the noise therefore within 13 %. An estimate that is further off passes once in 4,300
-    # sets of seeds (3.5 standard errors on one side). Passes have 16 samples per pixel; with 32
-    # samples there are two, the fewest that have an estimate.
+    # sets of seeds (3.5 standard errors on one side). 32 samples are two passes of 16, the fewest
+    # that can be compared; 31 are one, which is judged by its halves.
     scene = mi.load_dict(description(16, rfilter, twist=0, quotient=False))  # quick
     count = 48
-    renders = [luminances(scene, spp, 16, seed) for seed in range(count)]
+    renders = [luminances(scene, spp, pass_spp, seed) for seed in range(count)]
     mean = sum(image for image, _ in renders) / count
     scale = dr.maximum(mean, dr.mean(mean))
     differences = []
@@ -79,7 +85,19 @@ def luminances(scene, spp, pass_spp, seed):
     still = still_of(scene, spp, pass_spp, seed)
     state = sums_of(still, *range(still.count))
     total, weight = luminance(still.film, state.sums.values)
-    return mi.Float(total / weight), stills.noise(still.film, state.sums)
+    return mi.Float(total / weight), state.noise or stills.noise(still.film, state.sums)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_judging_a_pass_by_its_halves_changes_no_bit_of_the_picture(rgb, rfilter):
+    scene = mi.load_dict(description(8, rfilter))
+    one = sums_of(still_of(scene, 16, 16), 0)
+    assert one.noise > 0
+    # As the first of two passes it is not judged
+    first = sums_of(still_of(scene, 32, 16), 0)
+    assert first.noise is None
+    for name in ("values", "moments", "points"):
+        assert equal(getattr(one.sums, name), getattr(first.sums, name))
 
 
 def with_luminances(still, *passes):
@@ -113,6 +131,8 @@ def test_noise_of_passes_that_differ_by_a_known_amount(small):
         (None, 0, "not estimated: no passes"),
         (None, 1, "not estimated: one pass"),
         (None, 2, "not stated"),  # as by an earlier version
+        (0.02, 1, "0.02"),
+        (0.0, 1, "0: both halves of the pass are equal"),
         (0.0, 2, "0: all passes are equal"),
         (math.inf, 2, "infinite: no pixel is finite"),
         (0.0123456, 2, "0.0123"),
