@@ -110,6 +110,7 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
 
     named = {shape.id(): shape for shape in scene.shapes() if shape.id()}
     if name not in named:
+        _refuse_parts_of_groups(scene, name)
         near = nearest(name, named)
         there = f"there are {shorten(', '.join(named), 1000, placeholder=' ...')}"
         raise ValueError(
@@ -121,6 +122,18 @@ def middle_of(scene: mi.Scene, name: str) -> tuple[float, ...]:
     if not box.valid():
         raise ValueError(f'the shape "{name}" has no extent to aim at.')
     return tuple(box.center())
+
+
+def _refuse_parts_of_groups(scene, name):
+    nodes = mi.traverse(scene).hierarchy
+    if not any(isinstance(node, mi.Shape) and node.id() == name for node in nodes):
+        return
+    instances = [s.id() for s in scene.shapes() if s.class_name() == "Instance" and s.id()]
+    such = shorten(", ".join(instances), 300, placeholder=" ...")
+    raise ValueError(
+        f'"{name}" belongs to a shapegroup, which is nowhere by itself: name an instance of it'
+        + (f", such as {such}." if instances else ", which needs an id, or give a point.")
+    )
 
 
 def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:

@@ -24,9 +24,10 @@ import mitsuba as mi
 
 from . import __version__, aiming, checkpoint, exr, jobs, png, stills
 from .errors import cause_of
-from .fitting import FITS
+from .fitting import FITS, outside
 from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
+from .parameters import nearest
 from .registration import refusal
 from .signals import Watch
 from .sums import name_noise, name_passes
@@ -114,10 +115,17 @@ class Target(click.ParamType):
     name = "x,y,z|SHAPE-ID"
 
     def convert(self, value, param, ctx):
-        try:
-            return Triple().convert(value, param, ctx)
-        except click.BadParameter:
-            return value
+        parts = [part.strip() for part in value.split(",")]
+        if len(parts) > 1 and any(parts) and all(not part or _is_number(part) for part in parts):
+            return Triple().convert(value, param, ctx)  # meant as a point, if not written as one
+        return value
+
+
+def _is_number(text):
+    with contextlib.suppress(ValueError):
+        float(text)
+        return True
+    return False
 
 
 class Stopped(click.ClickException):
@@ -133,10 +141,15 @@ class FittingCommand(click.Command):
 
     def parse_args(self, ctx, args):
         args = [
-            "--fit=shapes" if arg == "--fit" and following not in FITS else arg
+            "--fit=shapes" if arg == "--fit" and not self._means_a_fit(following) else arg
             for arg, following in zip(args, [*args[1:], ""], strict=False)
         ]
         return super().parse_args(ctx, args)
+
+    @staticmethod
+    def _means_a_fit(word):
+        # Misspelt, too, so that the complaint names those that there are
+        return word in FITS or (nearest(word, FITS) is not None and not os.path.exists(word))
 
 
 class PassesOption(click.Option):
@@ -406,14 +419,19 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
     _scene_path(scene)
     _set_variant(mode)
     job = jobs.Job(scene, mode, dict(define), dict(properties), sensor, fit=fit)
-    opened = jobs.open_scene(job, _note, merge=False)
+    opened = jobs.open_scene(job, _note, aiming=True)
     camera = opened.scene.sensors()[sensor]
     if camera.class_name() == "BatchSensor":
         raise click.ClickException(
             f"the sensor {sensor} is a batch of several: aim at a copy of the scene with one."
         )
     before = camera.world_transform()
-    target = aiming.middle_of(opened.scene, at) if isinstance(at, str) else at
+    target = at
+    if isinstance(at, str):
+        target = aiming.middle_of(opened.scene, at)
+        advice = outside(opened.nil, at, target)
+        if advice:
+            _note(advice)
     up = up or aiming.up_of(before)
     origin = origin or aiming.columns_of(before)[3]
     found = aiming.look_at(opened.nil, origin, target, up, image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -20,12 +21,13 @@ FITS = {"shapes": "the shapes", "camera": "the shapes and the camera"}
 
 @dataclass(frozen=True)
 class Fit:
-    """Properties of "nil", as text; in sentences what they mean for the scene's camera; and what
-    options of the command follow from those."""
+    """Properties of "nil", as text; in sentences what they mean for the scene's camera; what
+    options of the command follow from those; and how to aim the camera, if it has to be."""
 
     properties: dict[str, str]
     notes: list[str]
     options: str
+    aim: str | None
 
 
 def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fit:
@@ -92,18 +94,19 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
             f"--fit: the camera's up is {up}, and the fibres run along {fibres}; this lets the "
             f"fibres run upright:\n{_kept({'fibres': up})}"
         )
+    aim = None
     target = _looked_at(scene, views[0])
     if target and not (quotient and outside):
         space = {"cell_size": size, "cell_origin": corner if quotient else halfway, "fibres": up}
         angle = _miss(nil, space, views[0], target)
         if angle > NEAR:
-            notes.append(
+            aim = (
                 f"--fit: in flat space the camera looks at {_text(target)}, which is seen "
                 f'{angle:.0f} degrees off the middle now: unless it is aimed, "nil-mitsuba aim" '
                 f"with the -D, -P, -s and --fit of this command and --at "
                 f"{_text(target, ',')[1:-1]} prints the to_world that looks there."
             )
-    return Fit(properties, notes, options)
+    return Fit(properties, notes, options, aim)
 
 
 def _miss(nil, space, view, target):
@@ -141,6 +144,18 @@ def unfitted(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator) -> str | No
         f"the shapes reach from {_text(box.min)} to {_text(box.max)}, and the cell from "
         f"{_text(corner)} to {_text([c + size for c in corner])}: "
         f"add {options} to fit it to them."
+    )
+
+
+def outside(nil: mi.Integrator, name: str, middle: Sequence[float]) -> str | None:
+    """One sentence on a shape whose middle the quotient's cell does not hold, or None."""
+    corner, size = nil.cell_origin, nil.cell_size
+    if not nil.quotient or _holds(corner, size, middle):
+        return None
+    return (
+        f'the middle of the shape "{name}", {_text(middle)}, lies outside of the cell, which '
+        f"reaches from {_text(corner)} to {_text([c + size for c in corner])}, and is cut off: add "
+        "--fit camera, or set cell_size and cell_origin."
     )
 
 

@@ -70,13 +70,14 @@ class Opened(NamedTuple):
 
 
 def open_scene(
-    job: Job, note: Callable[[str], None] = lambda _: None, merge: bool = True
+    job: Job, note: Callable[[str], None] = lambda _: None, aiming: bool = False
 ) -> Opened:
     """Load a job's scene; sets the job's variant.
 
-    ``note`` is told, in sentences, what differs from the scene file. Without ``merge`` meshes keep
-    their ids, and take longer to render. Raises ValueError, RuntimeError or OSError with a sentence
-    if the scene cannot be loaded, or if it is not the one with the job's hash.
+    ``note`` is told, in sentences, what differs from the scene file. For ``aiming`` meshes keep
+    their ids, which takes longer to render, and no one is told to aim. Raises ValueError,
+    RuntimeError or OSError with a sentence if the scene cannot be loaded, or if it is not the one
+    with the job's hash.
     """
     mi.set_variant(job.variant)
     with _beside(job.path), _enough_threads():
@@ -94,7 +95,7 @@ def open_scene(
             raise ValueError(f'"{job.path}" or a file that it names differs from the one expected.')
         layers = getattr(integrator, "layers", ())
         # Merged meshes have no numbers of their own
-        scene = files.scene(merge=merge and "shape" not in layers)
+        scene = files.scene(merge=not aiming and "shape" not in layers)
         sensors = scene.sensors()
         if not sensors:
             raise ValueError(f'the scene "{job.path}" has no sensor.')
@@ -115,6 +116,8 @@ def open_scene(
             further |= fitted.properties
             for sentence in fitted.notes:
                 note(sentence)
+            if fitted.aim and not aiming:
+                note(fitted.aim)
         elif foreign and not CELL & job.properties.keys():
             advice = unfitted(scene, sensors[job.sensor], files.nil())
             if advice:

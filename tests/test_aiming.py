@@ -318,6 +318,10 @@ def test_one_of_several_sensors_is_aimed(command, folder):
         (["--at", "box", "--image", "1,0"], 'expected three whole numbers i,j,k, and "1,0" is not'),
         (["--at", "box", "-P", "quotient=false", "--image", "1,0,0"], "plain Nil has no images"),
         (["--at", "box", "--from", "1,2,nan"], "expected three numbers x,y,z"),
+        (["--at", "1,2"], 'expected three numbers x,y,z, and "1,2" is not'),
+        (["--at", "1,nan,2"], 'expected three numbers x,y,z, and "1,nan,2" is not'),
+        (["--at", "1, 2,"], 'expected three numbers x,y,z, and "1, 2," is not'),
+        (["--at", "a,1"], 'no shape has the id "a,1"'),
         (["--at", "0.2,0.1,0.1"], "up = (0, 0, 1) does not say where up is"),
         (["--at", "box", "-s", "1"], "has no sensor 1"),
         (["--at", "box", "--from", "0,0,0", "--fit", "camera"], "--from moves it"),
@@ -329,6 +333,45 @@ def test_what_cannot_be_aimed_at_is_told_in_one_sentence(command, folder, argume
     (folder / "scene.xml").write_text(scene(NIL, PLAIN, BOX))
     status, out, err = command("aim", "scene.xml", *arguments)
     assert status and not out and sentence in complaint(err)
+
+
+GROUP = """
+    <shape type="shapegroup" id="tree"><shape type="sphere" id="crown"/></shape>
+    <shape type="instance"{}><ref id="tree"/>
+        <transform name="to_world">
+            <scale value="0.1"/><translate value="0.6, 0.8, 0.4"/>
+        </transform>
+    </shape>
+"""
+
+
+def test_instances_are_aimed_at_and_their_groups_are_not(command, folder):
+    (folder / "scene.xml").write_text(scene(NIL, PLAIN, GROUP.format(' id="oak"')))
+    assert command("aim", "scene.xml", "--at", "oak")[0] == 0
+    for name in ("tree", "crown"):
+        status, _, err = command("aim", "scene.xml", "--at", name)
+        assert status == 1 and f'"{name}" belongs to a shapegroup' in complaint(err)
+        assert complaint(err).endswith("name an instance of it, such as oak.")
+
+
+def test_a_shape_outside_of_the_cell_is_told_at_aiming(command, folder):
+    ball = '<shape type="sphere" id="ball"><point name="center" value="0.6, 3, 0.4"/></shape>'
+    (folder / "scene.xml").write_text(scene(NIL, PLAIN, ball))
+
+    def said(*arguments):
+        status, out, err = command("aim", "scene.xml", *arguments)
+        assert status == 0 and "<transform" in out
+        return err
+
+    note = (
+        'the middle of the shape "ball", (0.6, 3, 0.4), lies outside of the cell, which reaches '
+        "from (0, 0, 0) to (1, 1, 1), and is cut off: add --fit camera, or set cell_size and "
+        "cell_origin.\n"
+    )
+    assert said("--at", "ball") == note
+    assert "lies outside" not in said("--at", "ball", "--fit", "camera")
+    for options in (["--at", "0.6,3,0.4"], ["--at", "ball", "-P", "quotient=false"]):
+        assert said(*options) == ""
 
 
 def test_a_batch_is_no_camera_to_aim(command, folder):

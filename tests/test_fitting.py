@@ -103,7 +103,7 @@ def test_the_identity_of_plain_nil_is_halfway_from_the_camera_to_the_shapes(fitt
     assert "cells away" not in err
 
 
-def test_what_the_flat_camera_looked_at_is_offered_to_aim(fitted):
+def test_what_the_flat_camera_looked_at_is_offered_to_aim(command, fitted):
     tilted = SENSOR.replace('origin="0.5, 0.5, 0.1"', 'origin="0.9, 0.9, 0.1"')
     tilted = tilted.replace('target="0.5, 0.5, 1"', 'target="0.5, 0.5, 0.7"')
     err = fitted(NIL, tilted, LAMP, fit=["--fit=camera"])[2]
@@ -112,6 +112,9 @@ def test_what_the_flat_camera_looked_at_is_offered_to_aim(fitted):
     assert (
         "to_world" not in fitted(NIL, tilted, LAMP, fit=["--fit=camera"], more=["-P", "twist=0"])[2]
     )
+    # Whoever aims already is not told to
+    _, _, err = command("aim", "scene.xml", "--fit=camera", "--at", f"{x},{y},{z}")
+    assert "--fit: the cell is" in err and "to_world" not in err
 
 
 def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(fitted):
@@ -134,5 +137,6 @@ def test_fit_needs_something_to_fit(command, folder):
     (folder / "scene.xml").write_text(scene(NIL, SENSOR))
     status, _, err = command("render", "scene.xml", "--fit")
     assert status == 1 and "--fit needs a scene" in complaint(err)
-    status, _, err = command("render", "scene.xml", "--fit=walls")
-    assert status == 2 and "'walls' is not one of" in complaint(err)
+    for fit in (["--fit=walls"], ["--fit", "cam"], ["--fit", "shape"]):
+        status, _, err = command("render", *fit, "scene.xml")
+        assert status == 2 and "is not one of 'shapes', 'camera'" in complaint(err)
