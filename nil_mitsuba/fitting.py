@@ -13,6 +13,9 @@ from .aiming import columns_of, look_at, up_of
 from .scene_files import number_text
 
 MARGIN = 1e-3  # of the scene's largest extent: keeps walls and camera clear of the cube's faces
+DIGITS = 5  # so that rounding takes less than a fiftieth of the margin on either side
+# Of the cell: what is so far away leans by 3 degrees, a common field of view's twentieth
+DWARFED = 0.1
 NEAR = 5.0  # degrees, a tenth of a common field of view: a target so near the middle is seen well
 
 # What the cell may be fitted to, by the word behind --fit
@@ -42,7 +45,8 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     from .camera import transforms  # needs a variant
     from .shapes import Shapes
 
-    box = Shapes(scene).box
+    shapes = Shapes(scene)
+    box = shapes.box
     if not box.valid() or max(box.extents()) == 0:
         raise ValueError("--fit needs a scene with shapes of some extent.")
     middle = box.center()
@@ -51,14 +55,10 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     if what == "camera":
         for camera in cameras:
             box.expand(camera)
-    size = max(box.extents()) * (1 + MARGIN)
-    corner = box.center() - size / 2
     quotient = getattr(nil, "quotient", True)
-    halfway = [(a + b) / 2 for a, b in zip(cameras[0], middle, strict=True)]
-    properties = {
-        "cell_size": number_text(size),
-        "cell_origin": ",".join(map(number_text, corner if quotient else halfway)),
-    }
+    size, corner = _cube(box)
+    halfway = _rounded([(a + b) / 2 for a, b in zip(cameras[0], middle, strict=True)], size)
+    properties = _cell(size, corner if quotient else halfway)
     where = (
         f"the cell is the smallest cube around {FITS[what]}"
         if quotient
@@ -69,6 +69,16 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
         f"--fit: {where}. It is kept by these lines in the integrator, or by these options of the "
         f"command:\n{_kept(properties)}"
     ]
+    huge, rest = _giants(shapes, cameras if quotient or what == "camera" else [], size)
+    if huge:
+        smaller, its_corner = _cube(rest)
+        cell = _cell(smaller, its_corner if quotient else halfway)
+        notes.append(
+            f"--fit: all but {huge} would fit into a cell of {cell['cell_size']}, and in one so "
+            "much larger next to nothing bends where they are; this lets it bend"
+            + (f", and cuts off what of {huge} reaches out of the cell" if quotient else "")
+            + f":\n{_kept(cell)}"
+        )
     options = "--fit"
     outside = [camera for camera in cameras if not _holds(corner, size, camera)]
     way = math.dist(cameras[0], middle) / size
@@ -109,6 +119,46 @@ def fit(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator, what: str) -> Fi
     return Fit(properties, notes, options, aim)
 
 
+def _cube(box):
+    """Edge and corner of a cube around a box, with a margin, in few digits."""
+    size = max(box.extents()) * (1 + MARGIN)
+    (size,) = _rounded([size], size)
+    return size, _rounded([c - size / 2 for c in box.center()], size)
+
+
+def _rounded(numbers, size):
+    """Numbers in so many digits that a cell of a size moves by less than its margin."""
+    digits = DIGITS - math.floor(math.log10(size))
+    return [round(number, digits) for number in numbers]
+
+
+def _cell(size, origin):
+    return {"cell_size": number_text(size), "cell_origin": ",".join(map(number_text, origin))}
+
+
+def _giants(shapes, cameras, size):
+    """The names of one or two shapes without which a cell for the others and for cameras would be
+    as small as `DWARFED`, and a box around those; or None and anything."""
+    known = [
+        (max(extent.box.extents()), shape.id(), extent.box)
+        for shape, extent in zip(shapes.shapes, shapes.extents, strict=True)
+        if extent.box.valid()
+    ]
+    known.sort(key=lambda entry: entry[0], reverse=True)
+    for count in (1, 2):  # such as the ground and a sky around it
+        box = mi.ScalarBoundingBox3f()
+        for _, _, other in known[count:]:
+            box.expand(other)
+        if not box.valid():
+            break
+        for camera in cameras:
+            box.expand(camera)
+        if 0 < max(box.extents()) < DWARFED * size:
+            names = [f'"{name}"' if name else "a shape without id" for _, name, _ in known[:count]]
+            return " and ".join(names), box
+    return None, None
+
+
 def _miss(nil, space, view, target):
     """By how many degrees a camera's central geodesic misses what it looks at in flat space."""
     bent = mi.load_dict(
@@ -140,8 +190,9 @@ def unfitted(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator) -> str | No
     if all(_holds(corner, size, point) for point in (box.min, box.max)):
         return None
     options = fit(scene, sensor, nil, "shapes").options
+    low, high = (_rounded(corner, max(box.extents())) for corner in (box.min, box.max))
     return (
-        f"the shapes reach from {_text(box.min)} to {_text(box.max)}, and the cell from "
+        f"the shapes reach from {_text(low)} to {_text(high)}, and the cell from "
         f"{_text(corner)} to {_text([c + size for c in corner])}: "
         f"add {options} to fit it to them."
     )
@@ -173,7 +224,7 @@ def _looked_at(scene, view):
 
 
 def _text(point, comma=", "):
-    return f"({comma.join(f'{c:.4g}' for c in point)})"
+    return f"({comma.join(f'{c + 0.0:.4g}' for c in point)})"  # + 0.0: a zero has no sign
 
 
 TYPES = {"cell_size": "float", "cell_origin": "point", "fibres": "string"}

@@ -50,11 +50,13 @@ class NilIntegrator(ADIntegrator):
         super().__init__(mi.Properties())
         # Tests switch emitter sampling off: estimates are then exact where furnaces are.
         self.emitter_sampling = True
+        # Whoever has said more of shapes outside of the cell than the warning has it left out.
+        self.cell_is_known = False
         self._set({name: props.get(name) for name in props.keys()})
 
     def __setattr__(self, name, value):
         # What is set on an integrator that is there is checked as what a scene file says
-        if name == "emitter_sampling":
+        if name in ("emitter_sampling", "cell_is_known"):
             super().__setattr__(name, value)
         else:
             self._set(self._given | {name: value})
@@ -357,7 +359,7 @@ def _warn_of_what_is_ignored(scene, shapes, integrator):
             outside.append((reach, name_of(shape)))
         if shape.is_medium_transition():
             mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is ignored.")
-    if outside:
+    if outside and not integrator.cell_is_known:
         reach, name = max(outside)
         others = f" (the farthest of {len(outside)})" if len(outside) > 1 else ""
         mi.Log(

@@ -105,6 +105,7 @@ def open_scene(
                 f"from 0 to {len(sensors) - 1}."
             )
         further: dict[str, str] = {}
+        advice = None
         if job.fit:
             chosen = sorted(CELL & job.properties.keys())
             if chosen:
@@ -126,6 +127,8 @@ def open_scene(
             further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
         if further:
             integrator = files.integrator(**further)
+        if advice and hasattr(integrator, "view"):
+            integrator.cell_is_known = True
     job = replace(job, properties=job.properties | further, scene_hash=scene_hash, fit=None)
     return Opened(job, scene, integrator, files.nil(), layers)
 

@@ -82,6 +82,35 @@ def test_fit_camera_holds_every_sensor_of_a_batch(rgb):
     assert [note for note in found.notes if "the camera at (-3, 0, 0) lies outside" in note]
 
 
+def test_what_makes_the_cell_too_large_to_bend_is_named(fitted):
+    ground = """
+        <shape type="rectangle" id="ground"><bsdf type="diffuse"/><transform name="to_world">
+            <scale value="{}"/><translate value="0, 0, -1"/></transform></shape>
+    """
+    sky = '<shape type="sphere" id="dome"><float name="radius" value="900"/></shape>'
+    _, _, err = fitted(NIL, SENSOR, LAMP, ground.format(100))
+    assert '--fit: all but "ground" would fit into a cell of 0.75075, and' in err
+    assert 'cuts off what of "ground" reaches out' in err
+    (options,) = re.findall("this lets it bend.*:\n(?: +<.*\n)* +(-P .*)\n", err)
+    corner, size, _ = fitted(NIL, SENSOR, LAMP, fit=[], more=options.split())
+    assert size == pytest.approx(0.75075)
+    assert all(c < x < c + size for c, x in zip(corner, (0.5, 0.5, 0.1)))  # the camera, too
+    plain = ["-P", "quotient=false"]
+    err = fitted(NIL, SENSOR, LAMP, ground.format(100), sky, more=plain)[2]
+    assert 'all but "dome" and "ground" would fit into a cell of 0.3003' in err
+    assert "cuts off" not in err
+    err = fitted(NIL, SENSOR, LAMP, ground.format(100), fit=["--fit=camera"], more=plain)[2]
+    assert "would fit into a cell of 0.75075" in err
+    # No ground is too large of which the rest takes a third
+    assert "would fit" not in fitted(NIL, SENSOR, LAMP, ground.format(1))[2]
+
+
+def test_fit_prints_no_more_digits_than_it_needs(fitted):
+    corner, size, err = fitted(NIL, SENSOR, LAMP)
+    assert "-P cell_size=0.3003 -P cell_origin=0.34985,0.34985,0.54985\n" in err
+    assert (size, corner) == (pytest.approx(0.3003), pytest.approx([0.34985, 0.34985, 0.54985]))
+
+
 def test_fibres_are_suggested_along_the_cameras_up(fitted):
     err = fitted(NIL, SENSOR, LAMP)[2]  # y is up
     assert '<string name="fibres" value="y"/>\n    -P fibres=y\n' in err
@@ -131,6 +160,15 @@ def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(fitted):
         ((path, SENSOR, LAMP), (), ()),
     ):
         assert "to fit it to them" not in fitted(*parts, fit=fit, more=more)[2]
+
+
+def test_a_foreign_scene_out_of_the_cell_is_told_once(command, folder):
+    for kind, warned in (("path", False), ("nil", True)):
+        foreign = f'<integrator type="{kind}"/>'
+        (folder / "scene.xml").write_text(scene(foreign, SENSOR, FAR_LAMP))
+        _, out, err = command("render", "scene.xml")
+        assert ("reaches 7.15 scene units out of the cube" in out) == warned
+        assert ("to fit it to them" in err) != warned
 
 
 def test_fit_needs_something_to_fit(command, folder):
