@@ -48,12 +48,23 @@ def texture_of(path):
 
 
 def load(path, up, texture=None):
-    """The mesh with its colours, scaled to EXTENT, upright and standing on FOOT."""
+    """The mesh with its colours, scaled to EXTENT, upright and standing on FOOT.
+
+    Raises ValueError if the file holds no mesh.
+    """
     T = mi.ScalarTransform4f
     description = {"type": path.suffix[1:].lower(), "filename": str(path)}
     turn = T().rotate([1, 0, 0], 90) if up == "y" else T()
-    bare = mi.load_dict(description | {"to_world": turn})
+    try:
+        bare = mi.load_dict(description | {"to_world": turn})
+    except RuntimeError as error:
+        reason = str(error).rsplit("] ", 1)[-1]  # behind the places in Mitsuba's source
+        raise ValueError(f'"{path}" holds no mesh that can be read: {reason}') from None
+    if not bare.face_count() or dr.max(bare.faces_buffer())[0] >= bare.vertex_count():
+        raise ValueError(f'"{path}" has no triangles, or some whose corners are not in it.')
     box = bare.bbox()
+    if not 0 < max(box.extents()) < 1e15:  # what "nil" can place
+        raise ValueError(f'"{path}" has no extent, or one that is no number up to 1e15.')
     middle = box.center()
     to_world = T().translate(FOOT).scale(EXTENT / max(box.extents()))
     to_world = to_world @ T().translate([-middle.x, -middle.y, -box.min.z]) @ turn
@@ -154,7 +165,10 @@ def main():
 
     mi.set_variant("llvm_ad_rgb")
     up = options.up or upward_axis(options.mesh)
-    mesh = load(options.mesh, up, options.texture or texture_of(options.mesh))
+    try:
+        mesh = load(options.mesh, up, options.texture or texture_of(options.mesh))
+    except ValueError as error:
+        sys.exit(f"own_mesh.py: {error}")
     scene = mi.load_dict(stage(mesh, options.size))
     image = nil_mitsuba.render(scene, spp=options.spp, seconds=options.seconds, progress=show)
     print(file=sys.stderr)

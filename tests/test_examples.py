@@ -173,6 +173,29 @@ def test_own_mesh_says_what_it_reads():
     assert '"a.stl" is no mesh that this program reads: give a .ply or .obj.' in result.stderr
 
 
+POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+TABLE = COLOURED.split("3 0 1 2")[0]
+
+
+@pytest.mark.parametrize(
+    "name, text, sentence",
+    [
+        ("a.ply", "", "holds no mesh that can be read: "),
+        ("a.obj", "", "holds no mesh that can be read: "),
+        ("a.obj", POINTS + "f 1 2 4\n", "reference to invalid vertex 4!"),
+        ("a.obj", "v 1 2 3\nv 1 2 3\nv 1 2 3\nf 1 2 3\n", "has no extent"),
+        ("a.ply", TABLE + "3 0 1 7\n", "some whose corners are not in it"),
+        ("a.ply", TABLE, "holds no mesh that can be read: "),
+    ],
+)
+def test_own_mesh_says_in_a_sentence_that_a_file_is_broken(rgb, tmp_path, name, text, sentence):
+    (tmp_path / name).write_text(text)
+    own_mesh = runpy.run_path(str(ROOT / "examples" / "own_mesh.py"))
+    with pytest.raises(ValueError, match=re.escape(sentence)) as raised:
+        own_mesh["load"](tmp_path / name, "z")
+    assert str(raised.value).startswith(f'"{tmp_path / name}" h') and "\n" not in str(raised.value)
+
+
 def test_a_ball_holds_as_many_images_of_a_light_as_it_has_volume(rgb, tmp_path):
     pytest.importorskip("altair")
     pytest.importorskip("vl_convert")
