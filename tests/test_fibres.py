@@ -11,9 +11,10 @@ import mitsuba as mi
 import pytest
 
 from benchmarks.studio import film, gradient, texture
+from nil_mitsuba import checkpoint
 from nil_mitsuba.layers import RENDERED
 from nil_mitsuba.output import metadata_of
-from small_stills import description, still_of
+from small_stills import description, equal, still_of, sums_of
 from ztest import Estimate, assert_same_expectation
 
 # The scene's axes that take the places of x, y and z
@@ -365,6 +366,32 @@ def test_without_a_twist_it_does_not_matter_where_fibres_run(rgb):
         for fibres in "zx"
     ]
     assert dr.allclose(*images, rtol=1e-4)
+
+
+def operations(fibres):
+    """How many each kernel of a render has, from the smallest to the largest."""
+    scene = mi.load_dict(description(fibres=fibres))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        mi.render(scene, spp=4)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    return sorted(kernel["operation_count"] for kernel in history)
+
+
+@pytest.mark.parametrize("fibres", [pytest.param("x", marks=pytest.mark.verify), "y"])
+def test_kernels_do_not_grow_where_fibres_run_along_another_axis(rgb, fibres):
+    sizes, usual = operations(fibres), operations("z")
+    assert usual[-1] > 1000 and len(sizes) == len(usual)
+    assert all(size <= other for size, other in zip(sizes, usual))
+
+
+def test_a_still_with_other_fibres_goes_on_from_its_checkpoint(rgb, tmp_path):
+    still = still_of(mi.load_dict(description(fibres="y")), spp=8, pass_spp=4)
+    checkpoint.save(tmp_path / "a.sums", sums_of(still, 0))
+    resumed = still.start(tmp_path / "a.sums", resume=True)
+    assert list(still.todo(resumed, stop=still.count)) == [1]
+    resumed = resumed.plus(still.render(1))
+    assert equal(still.develop(resumed), still.develop(sums_of(still, 0, 1)))
 
 
 def test_a_picture_tells_where_its_fibres_run(rgb):
