@@ -13,6 +13,26 @@ UPRIGHT = SENSOR.replace('target="0.5, 0.5, 1" up="0, 1, 0"', 'target="0.5, 1, 0
 
 
 @pytest.fixture
+def said(command, folder):
+    """What is said of a scene and its cell, by a command that does not render."""
+
+    def run(*parts, fit=("--fit",), more=()):
+        (folder / "scene.xml").write_text(scene(*parts))
+        at = ("--at", "0.52,0.53,0.2", "-P", "max_distance=99")  # within reach in any cell
+        status, _, err = command("aim", *fit, "scene.xml", *at, *more)
+        assert status == 0, err
+        return err
+
+    return run
+
+
+def printed(err):
+    """The cell that was printed: its corner, or identity, and its edge."""
+    size, corner = re.search("-P cell_size=(.*) -P cell_origin=(.*)$", err, re.M).groups()
+    return [float(c) for c in corner.split(",")], float(size)
+
+
+@pytest.fixture
 def fitted(command, folder):
     """Renders a scene with a fitted cell: the cell's corner and edge, and what was said."""
 
@@ -42,16 +62,16 @@ def test_what_fit_prints_keeps_its_cell(fitted, fit):
     assert fitted(nil, SENSOR, FAR_LAMP, fit=[])[:2] == (corner, size)
 
 
-def test_a_camera_outside_of_the_fitted_cell_is_told_what_becomes_of_it(fitted):
-    _, _, err = fitted(NIL, SENSOR, FAR_LAMP)
+def test_a_camera_outside_of_the_fitted_cell_is_told_what_becomes_of_it(said):
+    err = said(NIL, SENSOR, FAR_LAMP)
     (warning,) = (line for line in err.splitlines() if "outside" in line)
     assert "the camera at (0.5, 0.5, 0.1) lies outside" in warning
     assert "--fit camera takes" in warning
     behind = LAMP.replace('z="0.7"', 'z="-0.7"')
-    assert "lies outside" in fitted(NIL, SENSOR, behind)[2]
+    assert "lies outside" in said(NIL, SENSOR, behind)
     # In plain Nil nothing is carried, nor with a camera that the shapes surround
-    assert "outside" not in fitted(NIL, SENSOR, FAR_LAMP, more=["-P", "quotient=false"])[2]
-    assert "outside" not in fitted(NIL, SENSOR, LAMP.replace("0.15", "3"))[2]
+    assert "outside" not in said(NIL, SENSOR, FAR_LAMP, more=["-P", "quotient=false"])
+    assert "outside" not in said(NIL, SENSOR, LAMP.replace("0.15", "3"))
 
 
 @pytest.mark.parametrize("fit", [("--fit", "camera"), ("--fit=camera",)])
@@ -82,13 +102,13 @@ def test_fit_camera_holds_every_sensor_of_a_batch(rgb):
     assert [note for note in found.notes if "the camera at (-3, 0, 0) lies outside" in note]
 
 
-def test_what_makes_the_cell_too_large_to_bend_is_named(fitted):
+def test_what_makes_the_cell_too_large_to_bend_is_named(fitted, said):
     ground = """
         <shape type="rectangle" id="ground"><bsdf type="diffuse"/><transform name="to_world">
             <scale value="{}"/><translate value="0, 0, -1"/></transform></shape>
     """
     sky = '<shape type="sphere" id="dome"><float name="radius" value="900"/></shape>'
-    _, _, err = fitted(NIL, SENSOR, LAMP, ground.format(100))
+    err = said(NIL, SENSOR, LAMP, ground.format(100))
     assert '--fit: all but "ground" would fit into a cell of 0.75075, and' in err
     assert 'cuts off what of "ground" reaches out' in err
     (options,) = re.findall("this lets it bend.*:\n(?: +<.*\n)* +(-P .*)\n", err)
@@ -96,13 +116,13 @@ def test_what_makes_the_cell_too_large_to_bend_is_named(fitted):
     assert size == pytest.approx(0.75075)
     assert all(c < x < c + size for c, x in zip(corner, (0.5, 0.5, 0.1)))  # the camera, too
     plain = ["-P", "quotient=false"]
-    err = fitted(NIL, SENSOR, LAMP, ground.format(100), sky, more=plain)[2]
+    err = said(NIL, SENSOR, LAMP, ground.format(100), sky, more=plain)
     assert 'all but "dome" and "ground" would fit into a cell of 0.3003' in err
     assert "cuts off" not in err
-    err = fitted(NIL, SENSOR, LAMP, ground.format(100), fit=["--fit=camera"], more=plain)[2]
+    err = said(NIL, SENSOR, LAMP, ground.format(100), fit=["--fit=camera"], more=plain)
     assert "would fit into a cell of 0.75075" in err
     # No ground is too large of which the rest takes a third
-    assert "would fit" not in fitted(NIL, SENSOR, LAMP, ground.format(1))[2]
+    assert "would fit" not in said(NIL, SENSOR, LAMP, ground.format(1))
 
 
 def test_fit_prints_no_more_digits_than_it_needs(fitted):
@@ -111,22 +131,24 @@ def test_fit_prints_no_more_digits_than_it_needs(fitted):
     assert (size, corner) == (pytest.approx(0.3003), pytest.approx([0.34985, 0.34985, 0.54985]))
 
 
-def test_fibres_are_suggested_along_the_cameras_up(fitted):
-    err = fitted(NIL, SENSOR, LAMP)[2]  # y is up
+def test_fibres_are_suggested_along_the_cameras_up(said):
+    err = said(NIL, SENSOR, LAMP)  # y is up
     assert '<string name="fibres" value="y"/>\n    -P fibres=y\n' in err
-    assert "fibres" not in fitted(NIL, SENSOR, LAMP, more=["-P", "fibres=y"])[2]
+    assert "fibres" not in said(NIL, SENSOR, LAMP, more=["-P", "fibres=y"])
     upright = '<integrator type="nil"><string name="fibres" value="y"/></integrator>'
-    assert "fibres" not in fitted(upright, SENSOR, LAMP)[2]
-    assert "fibres" not in fitted(NIL, UPRIGHT, LAMP)[2]
+    assert "fibres" not in said(upright, SENSOR, LAMP)
+    assert "fibres" not in said(NIL, UPRIGHT, LAMP)
 
 
-def test_the_identity_of_plain_nil_is_halfway_from_the_camera_to_the_shapes(fitted):
+def test_the_identity_of_plain_nil_is_halfway_from_the_camera_to_the_shapes(said):
     plain = ["-P", "quotient=false"]
-    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, more=plain)
+    err = said(NIL, SENSOR, FAR_LAMP, more=plain)
+    corner, size = printed(err)
     assert corner == pytest.approx(((0.5 - 7) / 2, 0.5, (0.1 + 0.7) / 2), rel=1e-5)
     assert size == pytest.approx(0.3 * (1 + 1e-3), rel=1e-6)
     assert "is 25 cells away from the camera" in err and "--fit camera takes a larger" in err
-    corner, size, err = fitted(NIL, SENSOR, FAR_LAMP, fit=["--fit=camera"], more=plain)
+    err = said(NIL, SENSOR, FAR_LAMP, fit=["--fit=camera"], more=plain)
+    corner, size = printed(err)
     assert corner == pytest.approx(((0.5 - 7) / 2, 0.5, (0.1 + 0.7) / 2), rel=1e-5)
     assert size == pytest.approx((0.5 + 7.15) * (1 + 1e-3), rel=1e-6)
     assert "cells away" not in err
@@ -146,11 +168,11 @@ def test_what_the_flat_camera_looked_at_is_offered_to_aim(command, fitted):
     assert "--fit: the cell is" in err and "to_world" not in err
 
 
-def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(fitted):
+def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(said):
     path = '<integrator type="path"/>'
-    err = fitted(path, SENSOR, FAR_LAMP, fit=[])[2]
+    err = said(path, SENSOR, FAR_LAMP, fit=[])
     assert ": add --fit camera -P fibres=y to fit it to them.\n" in err
-    upright = fitted(path, UPRIGHT, FAR_LAMP, fit=[], more=["-P", "quotient=false"])[2]
+    upright = said(path, UPRIGHT, FAR_LAMP, fit=[], more=["-P", "quotient=false"])
     assert ": add --fit camera to fit it to them.\n" in upright
     # A scene for "nil", one that is fitted, by hand or not, or one that fits
     for parts, fit, more in (
@@ -159,7 +181,7 @@ def test_a_foreign_scene_out_of_the_cell_is_told_the_options_that_fit(fitted):
         ((path, SENSOR, FAR_LAMP), (), ("-P", "cell_size=2")),
         ((path, SENSOR, LAMP), (), ()),
     ):
-        assert "to fit it to them" not in fitted(*parts, fit=fit, more=more)[2]
+        assert "to fit it to them" not in said(*parts, fit=fit, more=more)
 
 
 def test_a_foreign_scene_out_of_the_cell_is_told_once(command, folder):
