@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from . import __version__, aiming, checkpoint, exr, jobs, png, stills
 from .errors import cause_of
-from .fitting import FITS, outside
+from .fitting import FITS, cut_off
 from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .parameters import nearest
@@ -149,7 +149,8 @@ class FittingCommand(click.Command):
     @staticmethod
     def _means_a_fit(word):
         # Misspelt, too, so that the complaint names those that there are
-        return word in FITS or (nearest(word, FITS) is not None and not os.path.exists(word))
+        near = "." not in word and nearest(word, FITS)
+        return word in FITS or (bool(near) and not os.path.exists(word))
 
 
 class PassesOption(click.Option):
@@ -429,7 +430,7 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
     target = at
     if isinstance(at, str):
         target = aiming.middle_of(opened.scene, at)
-        advice = outside(opened.nil, at, target)
+        advice = cut_off(opened.nil, at, target)
         if advice:
             _note(advice)
     up = up or aiming.up_of(before)

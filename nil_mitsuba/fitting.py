@@ -198,7 +198,7 @@ def unfitted(scene: mi.Scene, sensor: mi.Sensor, nil: mi.Integrator) -> str | No
     )
 
 
-def outside(nil: mi.Integrator, name: str, middle: Sequence[float]) -> str | None:
+def cut_off(nil: mi.Integrator, name: str, middle: Sequence[float]) -> str | None:
     """One sentence on a shape whose middle the quotient's cell does not hold, or None."""
     corner, size = nil.cell_origin, nil.cell_size
     if not nil.quotient or _holds(corner, size, middle):

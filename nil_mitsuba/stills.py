@@ -178,7 +178,7 @@ class Still:
         """Pass number ``index``."""
         start = time.perf_counter()
         sums = self.passes.render(index)
-        own_noise = noise(self.film, sums)
+        own_noise = noise(self.film, sums) if sums.halves is not None else None
         return Checkpoint(self.settings, sums, time.perf_counter() - start, noise=own_noise)
 
     def start(self, path: str | os.PathLike | None, resume: bool) -> Checkpoint:
@@ -368,8 +368,6 @@ def noise(film: mi.Film, sums: Sums) -> float | None:
     is n/(n−1) Σ(S − R W)² / (ΣW)² to first order (Cochran, Sampling Techniques, eq. 6.13); with two
     halves, whose sums differ by D and V, it is (D − R V)² / (ΣW)².
     """
-    if sums.count < 2 and sums.halves is None:
-        return None
     total, weight = luminance(film, sums.values)
     pixels = len(weight)
 
@@ -392,7 +390,9 @@ def noise(film: mi.Film, sums: Sums) -> float | None:
     variance = dr.maximum(residuals, 0) / dr.square(weight)
     scale = dr.maximum(size, dr.sum(size) / count)
     squares = dr.select(seen & (scale > 0), variance / dr.square(scale), 0)
-    return dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
+    # Of one pass, too, so that the second compiles nothing
+    result = dr.select(dr.any(finite), dr.sqrt(dr.sum(squares) / count), dr.inf)[0]
+    return result if sums.count > 1 or sums.halves is not None else None
 
 
 @contextlib.contextmanager

@@ -88,9 +88,8 @@ def luminances(scene, spp, pass_spp, seed):
     return mi.Float(total / weight), state.noise or stills.noise(still.film, state.sums)
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
-def test_judging_a_pass_by_its_halves_changes_no_bit_of_the_picture(rgb, rfilter):
-    scene = mi.load_dict(description(8, rfilter))
+def test_judging_a_pass_by_its_halves_changes_no_bit_of_the_picture(rgb):
+    scene = mi.load_dict(description(8, "box"))  # others add samples up in any order
     one = sums_of(still_of(scene, 16, 16), 0)
     assert one.noise > 0
     # As the first of two passes it is not judged
