@@ -154,11 +154,6 @@ class Chords:
         """The sagitta that is allowed at arc length ``t``."""
         return dr.fma(self.spread, t, self.width)
 
-    def beyond(self, chord: Chord, part: mi.Float, t: mi.Float) -> mi.Float:
-        """What of a chord from arc length ``t`` on is left after a ``part``, or 0 if too short."""
-        rest = (1 - part) * chord.length
-        return dr.select((part < 1) & (rest > self.shortest(t)), rest, 0)
-
     def after(self, t: mi.Float, cap: mi.Float = dr.inf) -> mi.Float:
         """The chord that starts at arc length ``t``, no longer than ``cap`` if that can be."""
         h = self.scale * (self.spread + self._root(self.room(t)))
@@ -343,16 +338,6 @@ class Tracer:
         """The length h of a chord, of which the first one has the part ``unit`` only."""
         return dr.select(front.t == 0, larger(unit * h, self.least), h)
 
-    def _resumed(self, rest, owed, length, lift):
-        """The length and lift of the next chord: those of one that a face has cut, if any is left.
-
-        The gluing carries straight chords to straight ones, so that it ends where it would have.
-        A new one would begin anywhere beside the curve and yet end at a corner: the polygon would
-        be off to one side behind each face, by a third of a sagitta in the mean.
-        """
-        resumed = rest > 0
-        return dr.select(resumed, rest, length), dr.select(resumed, owed, lift)
-
     def _passed(self, chord, found, before):
         """Arc length from a chord's start to what its ray has found."""
         s = dr.fma(found.t, self.space.cells_per_unit, -before)
@@ -449,8 +434,6 @@ class Tracer:
         cap = mi.Float(dr.inf)
         valid, distance = mi.Bool(False), mi.Float(0)
         o, d = mi.Point3f(0), mi.Vector3f(0)
-        # Of a soft ray's chord that a face has cut: what lies beyond it, and its corner's lift
-        rest, owed = mi.Float(0), mi.Float(0)
 
         while active:
             if not quotient:
@@ -461,8 +444,6 @@ class Tracer:
                 h = smaller(chords.after(front.t, cap), reach - front.t)
                 length = self._phased(front, h, unit)
                 lift = corner(smaller(h, STEEPEST * length))
-                if dr.hint(quotient, mode="scalar"):
-                    length, lift = self._resumed(rest, owed, length, lift)
                 querying, leaps = mi.Bool(searching), None
                 if dr.hint(self.clearance is not None, mode="scalar"):
                     free = self._free(front, h, searching & ~cone.soft)
@@ -475,9 +456,6 @@ class Tracer:
                 length = smaller(length, reach - front.t)
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
-                if dr.hint(quotient, mode="scalar"):
-                    rest = dr.select(cone.soft, chords.beyond(chord, part, front.t), 0)
-                    owed = mi.Float(lift)
                 if dr.hint(leaps is not None, mode="scalar"):
                     part, face = dr.select(leaps, 1, part), dr.select(leaps, 0, face)
                 # Pieces overlap by the rounding of their joint, but none reaches behind the start
@@ -632,7 +610,6 @@ class Tracer:
         unit = random_of(p, v)
         front = self._start(start, p, v)
         blocked = mi.Bool(False)
-        rest, owed = mi.Float(0), mi.Float(0)  # as in `_along_chords`
         active = active & (reach > 0)
 
         while active:
@@ -643,19 +620,13 @@ class Tracer:
                 left = reach - front.t
                 h = smaller(chords.between(front.t, left), left)
                 length = self._phased(front, h, unit)
+                last = length >= left
+                length = smaller(length, left)
                 # As close to the curve near the light as near the start
-                lift = corner(smaller(h, STEEPEST * smaller(length, larger(left - length, 0))))
-                if dr.hint(quotient, mode="scalar"):
-                    length, lift = self._resumed(rest, owed, length, lift)
-                # Rounding leaves no sliver of a last chord that is resumed
-                last = length >= left - chords.shortest(front.t)
-                length = dr.select(last, left, length)
-                lift = dr.select(last, 0, lift)
+                rest = smaller(length, left - length)
+                lift = dr.select(last, 0, corner(smaller(h, STEEPEST * rest)))
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
-                if dr.hint(quotient, mode="scalar"):
-                    rest = chords.beyond(chord, part, front.t)
-                    owed = mi.Float(lift)
                 last &= part >= 1
                 s = part * chord.length
                 before = dr.select(front.t > 0, self.overlap, 0)
