@@ -155,7 +155,7 @@ def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:
     if any(abs(s - 1) > LEVEL for s in scale):
         lines.insert(0, f'<scale value="{_numbers(scale)}"/>')
     text = "\n    ".join(('<transform name="to_world">', *lines)) + "\n</transform>"
-    if "near_clip" in mi.traverse(sensor):  # Mitsuba's other sensors refuse a focus
+    if isinstance(sensor, mi.ProjectiveCamera):  # other sensors refuse a focus
         text += f'\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
     return text
 

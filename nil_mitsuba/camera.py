@@ -16,13 +16,12 @@ from . import geometry
 from .quotient import Space, opaque
 from .tracer import Cone
 
-SENSORS = {
-    "PerspectiveCamera": "perspective",
-    "ThinLensCamera": "thinlens",
-    "OrthographicCamera": "orthographic",
-    "RadianceMeter": "radiancemeter",
-    "BatchSensor": "batch",
-}
+SENSORS = (
+    "perspective, thinlens, orthographic, radiancemeter, batch, spherical, fisheye, "
+    "stereo_perspective"
+)
+
+OFFERED = {"near_clip", "to_world"}
 
 
 class Camera:
@@ -31,8 +30,8 @@ class Camera:
     def __init__(self, sensor: mi.Sensor, space: Space, tolerance: float):
         self.space = space
         self.tolerance = dr.opaque(mi.Float, tolerance)
-        self.thinlens = sensor.class_name() == "ThinLensCamera"
         parameters = mi.traverse(sensor)
+        self.thinlens = "aperture_radius" in parameters
         self.views = [
             _Frustum(parameters, child, transform) for child, transform in transforms(sensor)
         ]
@@ -101,28 +100,37 @@ class Camera:
 
 def transforms(sensor: mi.Sensor) -> list[tuple[str, mi.Transform4f]]:
     """To the world from each sensor of a batch, or from a sensor that is none; with the prefix of
-    its parameters. Raises RuntimeError for a sensor that "nil" does not render."""
-    name = sensor.class_name()
-    if name not in SENSORS:
-        raise RuntimeError(
-            f'the integrator "nil" has no meaning for the sensor "{name}": use '
-            f"{', '.join(SENSORS.values())}."
-        )
-    if name != "BatchSensor":
-        return [("", sensor.world_transform())]
-    # A batch lists its children's parameters behind their names.
+    its parameters. Raises RuntimeError for a sensor that "nil" does not render.
+
+    What a sensor is is told by its parameters alone, since all that are written in Python have one
+    class name: its rays start beyond a ``near_clip``, which is a plane if there is an ``x_fov``;
+    what moves them from ``to_world`` otherwise acts by the group product; ``aperture_radius`` makes
+    that a lens.
+    """
     parameters = mi.traverse(sensor)
+    # A batch lists its children's parameters behind their names.
     children = [
         key[: -len("shutter_open")] for key in parameters.keys() if key.endswith(".shutter_open")
     ]
     for child in children:
-        turned = f"{child}to_world" in parameters
-        if not turned or f"{child}aperture_radius" in parameters:
+        offered = {name for name in OFFERED if f"{child}{name}" in parameters}
+        if offered != OFFERED or f"{child}aperture_radius" in parameters:
             raise RuntimeError(
-                f'the integrator "nil" renders perspective and orthographic sensors inside '
-                f'a batch, and "{child[:-1]}" is neither: render it as a sensor of its own.'
+                f'the integrator "nil" renders sensors that have near_clip and to_world, and no '
+                f'lens, inside a batch, which "{child[:-1]}" is not: render it as a sensor of its '
+                "own."
             )
-    return [(child, mi.Transform4f(parameters[f"{child}to_world"])) for child in children]
+    if children:
+        return [(child, mi.Transform4f(parameters[f"{child}to_world"])) for child in children]
+    # A radiancemeter offers as little as sensors that are no camera
+    if not all(name in parameters for name in OFFERED) and sensor.class_name() != "RadianceMeter":
+        python = sensor.class_name() == "Sensor"  # all that are written in it
+        name = type(sensor).__name__ if python else sensor.class_name()
+        raise RuntimeError(
+            f'the integrator "nil" has no meaning for the sensor "{name}": use {SENSORS}'
+            + (", or show mi.traverse its near_clip and to_world." if python else ".")
+        )
+    return [("", sensor.world_transform())]
 
 
 class _Frustum:
@@ -134,8 +142,9 @@ class _Frustum:
         self.axis = opaque(dr.normalize(axis))
         near = f"{prefix}near_clip"
         self.near = opaque(mi.Float(parameters[near] if near in parameters else 0))
-        # An orthographic sensor's film may be scaled, and its rays are parallel.
-        self.parallel = near in parameters and f"{prefix}x_fov" not in parameters
+        # All rays of an orthographic sensor, whose film may be scaled, have the same way to the near
+        # clip plane, and those of a panorama the same way altogether.
+        self.even = near in parameters and f"{prefix}x_fov" not in parameters
         self.scale = opaque(dr.norm(axis))
 
     def depth(self, ray):
@@ -143,5 +152,5 @@ class _Frustum:
         return dr.dot(ray.d, self.axis)
 
     def near_of(self, ray):
-        """How far along a ray the near clip plane is."""
-        return self.near * self.scale if self.parallel else self.near / self.depth(ray)
+        """How far along a ray it begins."""
+        return self.near * self.scale if self.even else self.near / self.depth(ray)

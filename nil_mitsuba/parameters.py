@@ -45,7 +45,7 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
     if rr_depth <= 0:
         raise RuntimeError('"rr_depth" must be set to a value greater than zero!')
     quotient = _boolean(given, "quotient", True)
-    twist = _number(given, "twist", 1.0)
+    twist = number(given, "twist", 1.0)
     if quotient and twist != round(twist):
         raise RuntimeError(
             f'"twist" = {twist:g} does not glue the faces of the cube: use an integer such as '
@@ -99,7 +99,8 @@ def _boolean(given, name, default):
     return value
 
 
-def _number(given, name, default):
+def number(given: Mapping[str, Any], name: str, default: float) -> float:
+    """A finite number among properties; raises RuntimeError, with a sentence."""
     value = given.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise RuntimeError(f'The property "{name}" has the wrong type (expected <float>).')
@@ -109,7 +110,7 @@ def _number(given, name, default):
 
 
 def _positive(given, name, default):
-    value = _number(given, name, default)
+    value = number(given, name, default)
     if value <= 0:
         raise RuntimeError(f'"{name}" must be greater than zero, and it is {value:g}')
     return value

@@ -233,7 +233,9 @@ class Passes:
             sampler.seed(dr.opaque(mi.UInt32, pass_seed(self.seed, tile)), lanes)
         number, inside, ray, weight, position, across = self._sample_rays(sampler, sample // spp)
         start = self.camera.start(ray, across)
-        radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, inside)
+        # What a sensor shows nothing at, as around a dome's picture, is not traced
+        shown = inside & dr.any(weight != 0)
+        radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, shown)
 
         def add(block, points, halves):
             value, one = dr.select(inside, radiance * weight, 0), dr.select(inside, mi.Float(1), 0)
@@ -246,7 +248,7 @@ class Passes:
                 position,
                 value=value,
                 weight=one,
-                alpha=dr.select(valid & inside, mi.Float(1), 0),
+                alpha=dr.select(valid & shown, mi.Float(1), 0),
                 aovs=self._channels(seen, "mean"),
                 wavelengths=ray.wavelengths,
             )

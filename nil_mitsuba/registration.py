@@ -1,9 +1,10 @@
-"""Makes the integrator ``nil`` known to every Mitsuba variant, whenever it is set."""
+"""Makes the integrator ``nil`` and the sensors known to every Mitsuba variant, whenever it is set."""
 
 from __future__ import annotations
 
 import importlib
 import sys
+from types import ModuleType
 
 import mitsuba as mi
 
@@ -23,6 +24,9 @@ VARIANT_MODULES = (
     "nil_mitsuba.passes",
     "nil_mitsuba.integrator",
 )
+
+# The sensors are for any integrator, and so for the variants, too, that cannot run "nil".
+SENSORS_MODULE = "nil_mitsuba.sensors"
 
 WORKING_VARIANT = "llvm_ad_rgb"
 
@@ -58,6 +62,12 @@ def _register(_old: str | None, variant: str) -> None:
     # A variant loaded before this package was imported does not pass by the import guard again.
     llvm.require(variant)
 
+    # Looked up on each call: classes are others after each reload.
+    for name in _loaded(SENSORS_MODULE).SENSORS:
+        mi.register_sensor(
+            name, lambda props, name=name: sys.modules[SENSORS_MODULE].SENSORS[name](props)
+        )
+
     sentence = refusal(variant)
     if sentence:
 
@@ -65,13 +75,16 @@ def _register(_old: str | None, variant: str) -> None:
             raise RuntimeError(sentence)
     else:
         for name in VARIANT_MODULES:
-            if name in sys.modules:
-                importlib.reload(sys.modules[name])
-            else:
-                importlib.import_module(name)
+            _loaded(name)
 
         def construct(props):
-            # Looked up on each call: the class is another one after each reload.
             return sys.modules["nil_mitsuba.integrator"].NilIntegrator(props)
 
     mi.register_integrator("nil", construct)
+
+
+def _loaded(name: str) -> ModuleType:
+    """A module with the types of the current variant."""
+    if name in sys.modules:
+        return importlib.reload(sys.modules[name])
+    return importlib.import_module(name)
