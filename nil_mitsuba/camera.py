@@ -142,8 +142,8 @@ class _Frustum:
         self.axis = opaque(dr.normalize(axis))
         near = f"{prefix}near_clip"
         self.near = opaque(mi.Float(parameters[near] if near in parameters else 0))
-        # All rays of an orthographic sensor, whose film may be scaled, have the same way to the near
-        # clip plane, and those of a panorama the same way altogether.
+        # All rays of an orthographic sensor, whose film may be scaled, have the same way to the
+        # near clip plane, and so have those of a panorama, which has no plane.
         self.even = near in parameters and f"{prefix}x_fov" not in parameters
         self.scale = opaque(dr.norm(axis))
 

@@ -1,4 +1,4 @@
-"""Makes the integrator ``nil`` and the sensors known to every Mitsuba variant, whenever it is set."""
+"""Makes ``nil`` and the sensors known to every Mitsuba variant, whenever it is set."""
 
 from __future__ import annotations
 

@@ -43,14 +43,17 @@ class PythonSensor(mi.Sensor):
 
     NAME = ""
     EYE = ""  # if a scene names none
-    LISTED = ("near_clip", "far_clip")  # numbers that mi.traverse shows, besides to_world
+    LISTED: tuple[str, ...] = (
+        "near_clip",
+        "far_clip",
+    )  # numbers that mi.traverse shows, besides to_world
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.m_needs_sample_3 = False
         self.near_clip = mi.Float(number(props, "near_clip", 1e-2))  # as in `perspective`
         self.far_clip = mi.Float(number(props, "far_clip", 1e4))
-        self.to_world = self.m_to_world
+        self.to_world = self.world_transform()
 
     def _set_eyes(self, props):
         self.eye = props.get("eye", self.EYE)
