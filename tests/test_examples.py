@@ -46,6 +46,13 @@ def shows_something(mi, path, height=None, width=None):
         ),
         ("twist.py", ["--size", "24", "--spp", "2"], (24, 88), (24, 24)),
         ("own_mesh.py", ["--size", "48", "--spp", "2"], (27, 48), (27, 48)),
+        ("all_around.py", ["--size", "48", "--spp", "2"], (24, 48), (24, 48)),
+        (
+            "all_around.py",
+            ["--kind", "pair", "--size", "32", "--spp", "2"],
+            (24, 72),
+            (24, 32),
+        ),
     ],
 )
 def test_example_ends_in_a_picture(rgb, tmp_path, program, arguments, shape, first):

@@ -39,6 +39,7 @@ TESTED_BY = {
     "examples/twist.py": "test_examples.py",
     "examples/light_images.py": "test_examples.py",
     "examples/own_mesh.py": "test_examples.py",
+    "examples/all_around.py": "test_examples.py",
 }
 QUICK = (
     "benchmarks.camera_rays",
