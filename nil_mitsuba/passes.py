@@ -233,7 +233,7 @@ class Passes:
             sampler.seed(dr.opaque(mi.UInt32, pass_seed(self.seed, tile)), lanes)
         number, inside, ray, weight, position, across = self._sample_rays(sampler, sample // spp)
         start = self.camera.start(ray, across)
-        # What a sensor shows nothing at, as around a dome's picture, is not traced
+        # Where a sensor shows nothing, as around a dome's picture, nothing is traced
         shown = inside & dr.any(weight != 0)
         radiance, valid, seen = self.integrator.trace(self.view, sampler, ray, *start, shown)
 

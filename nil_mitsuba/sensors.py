@@ -36,17 +36,14 @@ class Look(NamedTuple):
 
 
 class PythonSensor(mi.Sensor):
-    """What the sensors of this module share: ``to_world``, clip distances, film, and eyes.
+    """What the sensors of this module share: pose, clip distances, film, and eyes.
 
     Raises RuntimeError with a sentence, as Mitsuba's own do, for values that make no sense.
     """
 
-    NAME = ""
     EYE = ""  # if a scene names none
-    LISTED: tuple[str, ...] = (
-        "near_clip",
-        "far_clip",
-    )  # numbers that mi.traverse shows, besides to_world
+    # Numbers that mi.traverse shows, besides to_world
+    LISTED: tuple[str, ...] = ("near_clip", "far_clip")
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -167,7 +164,7 @@ class PythonSensor(mi.Sensor):
         lines += [f"  shutter_open_time = {self.shutter_open_time()}"]
         lines += [f"  to_world = {self.to_world}"]
         text = ",\n".join(line.replace("\n", "\n  ") for line in lines)
-        return f"{self.NAME}[\n{text}\n]"
+        return f"{type(self).__name__}[\n{text}\n]"
 
 
 class Spherical(PythonSensor):
@@ -182,7 +179,6 @@ class Spherical(PythonSensor):
     the box filter, or `sample_border` is on: then any filter goes on across the seam and the poles.
     """
 
-    NAME = "Spherical"
     LISTED = (*PythonSensor.LISTED, "interocular_distance")
 
     def __init__(self, props: mi.Properties):
@@ -224,7 +220,6 @@ class Fisheye(PythonSensor):
     lengths along each ray (scene units).
     """
 
-    NAME = "Fisheye"
     LISTED = (*PythonSensor.LISTED, "fov")
     eye = ""
 
@@ -272,7 +267,6 @@ class StereoPerspective(PythonSensor):
     that of a `perspective` half the distance to its side.
     """
 
-    NAME = "StereoPerspective"
     EYE = "both"
     LENS = ("principal_point_offset_x", "principal_point_offset_y")
     LISTED = (*PythonSensor.LISTED, "interocular_distance", "x_fov", *LENS)

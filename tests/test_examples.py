@@ -47,11 +47,12 @@ def shows_something(mi, path, height=None, width=None):
         ("twist.py", ["--size", "24", "--spp", "2"], (24, 88), (24, 24)),
         ("own_mesh.py", ["--size", "48", "--spp", "2"], (27, 48), (27, 48)),
         ("all_around.py", ["--size", "48", "--spp", "2"], (24, 48), (24, 48)),
-        (
+        pytest.param(
             "all_around.py",
             ["--kind", "pair", "--size", "32", "--spp", "2"],
             (24, 72),
             (24, 32),
+            marks=pytest.mark.verify,
         ),
     ],
 )
