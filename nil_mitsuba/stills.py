@@ -528,13 +528,17 @@ def film_of(settings: dict) -> mi.Film:
 def hash_of(thing: mi.Scene | mi.Sensor) -> str:
     """SHA-256 of what is loaded: of its description and of all arrays that it lets one see.
 
-    Numbers of samples are no part of it: each render in between sets them.
+    Numbers of samples are no part of it: each render in between sets them. Nor is an address, which
+    is all that a batch says of itself: its sensors are asked.
     """
+    traversed = mi.traverse(thing)
+    sensors = [node for node in traversed.hierarchy if isinstance(node, mi.Sensor)]
     text = re.sub(
-        r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+", "", str(thing)
+        r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+|\[0x[0-9a-f]+\]",
+        "",
+        "\n".join(map(str, (thing, *sensors))),
     )
     digest = hashlib.sha256(text.encode())
-    traversed = mi.traverse(thing)
     for key in sorted(traversed.keys()):
         value = traversed[key]
         digest.update(key.encode())

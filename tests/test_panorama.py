@@ -716,6 +716,20 @@ def test_a_checkpoint_is_of_one_sensor_only(rgb, kind, given):
     assert len(scenes) == 2
 
 
+def test_a_batch_is_told_apart_by_what_its_sensors_are(rgb):
+    """It describes itself by an address, which tells nothing and differs from load to load."""
+
+    def batch(eye):
+        children = {"a": sensor("pair of panoramas", eye=eye), "b": {"type": "perspective"}}
+        return mi.load_dict(
+            {"type": "scene", "s": {"type": "batch", "film": film(8, 4)} | children}
+        )
+
+    scenes = [batch(eye) for eye in ("left", "left", "right")]  # all there at the same time
+    first, again, other = map(stills.hash_of, scenes)
+    assert first == again != other
+
+
 SCENE = """
 <scene version="3.0.0">
     <integrator type="nil"><float name="max_distance" value="2"/></integrator>
