@@ -49,7 +49,8 @@ class PythonSensor(mi.Sensor):
         super().__init__(props)
         self.m_needs_sample_3 = False
         self.near_clip = mi.Float(number(props, "near_clip", 1e-2))  # as in `perspective`
-        self.far_clip = mi.Float(number(props, "far_clip", 1e4))
+        endless = props.get("far_clip", 0) == math.inf  # "inf" in a scene file
+        self.far_clip = mi.Float(math.inf if endless else number(props, "far_clip", 1e4))
         self.to_world = self.world_transform()
 
     def _set_eyes(self, props):
@@ -66,17 +67,11 @@ class PythonSensor(mi.Sensor):
                 f'"eye" = {self.eye} needs "interocular_distance", which is in scene units'
             )
         self.interocular_distance = mi.Float(number(props, "interocular_distance", 0.0))
-        if self.eye == "both":
-            if self.film().size()[1] % 2:
-                raise RuntimeError(
-                    "\"eye\" = both puts the left eye's picture above the right one's, so that the "
-                    f"film's height must be even, and it is {self.film().size()[1]}"
-                )
-            if not self.film().rfilter().is_box_filter():
-                raise RuntimeError(
-                    "a filter wider than a pixel would mix the pictures of both eyes where they "
-                    'meet: put <rfilter type="box"/> into the film, or render each eye by itself'
-                )
+        if self.eye == "both" and not self.film().rfilter().is_box_filter():
+            raise RuntimeError(
+                "a filter wider than a pixel would mix the pictures of both eyes where they "
+                'meet: put <rfilter type="box"/> into the film, or render each eye by itself'
+            )
 
     def _size(self) -> tuple[int, int]:
         """Width and height (pixels) of one eye's whole picture."""
@@ -154,6 +149,13 @@ class PythonSensor(mi.Sensor):
         distance = _host(getattr(self, "interocular_distance", 0.0))
         if not 0 <= distance < math.inf:
             raise RuntimeError(f'"interocular_distance" must not be negative: it is {distance:g}')
+
+        # Here, since a batch sets its sensors' sizes after they are made, as mi.traverse does
+        if self.eye == "both" and self.film().size()[1] % 2:
+            raise RuntimeError(
+                "\"eye\" = both puts the left eye's picture above the right one's, so that the "
+                f"film's height must be even, and it is {self.film().size()[1]}"
+            )
 
     def to_string(self) -> str:
         """All that the picture depends on: checkpoints tell sensors apart by it."""

@@ -65,7 +65,7 @@ def starts(loaded, twist=1.0, place=None, fibres="z"):
 
     place = centres(loaded) if place is None else place
     space = Space(twist, False, [0, 0, 0], 1.0, fibres=fibres)
-    p, v, cone, _ = Camera(loaded, space, 0.25).start(rays(loaded, place)[0], place.x)
+    p, v, cone, *_ = Camera(loaded, space, 0.25).start(rays(loaded, place)[0], place.x)
     return p, v, cone
 
 
@@ -368,6 +368,35 @@ def test_clip_distances_are_lengths_along_every_ray(rgb):
     assert dr.count(left)[0] > 20 and dr.count(length > far)[0] > 20
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("integrator", ["path", "nil"])
+def test_without_a_far_clip_distance_all_is_seen(rgb, kind, integrator):
+    """As far as with one that is far enough."""
+    chosen = mi.load_dict(PLAIN if integrator == "nil" else {"type": "path", "max_depth": 2})
+    first, second = (
+        mi.render(furnished(of_kind(kind) | {"far_clip": far}), integrator=chosen, spp=1).array
+        for far in (math.inf, 1e4)
+    )
+    assert dr.all(first == second) and dr.mean(first)[0] > 0
+
+
+@pytest.mark.parametrize("air", [False, True], ids=["vacuum", "medium"])
+@pytest.mark.parametrize("kind", ["spherical", "thinlens"])
+def test_a_near_clip_distance_does_not_turn_the_sky(rgb, kind, air):
+    """It hides, and moves nothing: on that way geodesics turn by up to 0.6 here."""
+    lens = {"aperture_radius": 0.01, "focus_distance": 2.0} if kind == "thinlens" else {}
+    ball = {"type": "sphere", "center": [9, 9, 9], "radius": 1e-3, "bsdf": {"type": "null"}}
+    balls = {"ball": ball | {"interior": {"type": "homogeneous"}}} if air else {}
+    nil = mi.load_dict(PLAIN | {"twist": 2.0, "max_depth": 1})
+    pictures = []
+    for near in (NARROW, 0.3):
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(gradient(8, 4))}
+        camera = sensor(kind, 32, 16, near_clip=near) | lens
+        scene = mi.load_dict({"type": "scene", "sky": sky, "camera": camera} | balls)
+        pictures.append(mi.render(scene, integrator=nil, spp=16, seed=1).array)
+    assert dr.max(dr.abs(pictures[0] - pictures[1]))[0] < 1e-3
+
+
 def test_a_panorama_in_the_quotient_is_carried_into_the_cube(rgb):
     """The view from g·p is the view from p. Fails on equal expectations for one seed in 400."""
     twist, inside, g = 2, mi.Point3f(0.3, 0.4, 0.6), mi.Point3f(3, -2, 1)
@@ -624,6 +653,18 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(rgb, kind, given, sentence
         mi.load_dict({"type": kind, "film": film(8, 8)} | given)
 
 
+@pytest.mark.parametrize("kind", ["spherical", "stereo_perspective"])
+def test_a_height_that_two_eyes_cannot_share_is_refused_whoever_sets_it(rgb, kind):
+    """A batch, whose height its sensors get when they are there, or mi.traverse."""
+    pair = sensor(kind, 8, 8, eye="both", interocular_distance=0.1)
+    with pytest.raises(RuntimeError, match="height must be even, and it is 7"):
+        mi.load_dict({"type": "batch", "a": pair, "film": film(8, 7)})
+    parameters = mi.traverse(mi.load_dict(pair))
+    parameters["film.size"] = [8, 7]
+    with pytest.raises(RuntimeError, match="height must be even, and it is 7"):
+        parameters.update()
+
+
 def test_other_sensors_in_python_are_known_by_what_they_offer(rgb):
     """One that shows its near clip and its transform is a camera; of another nothing is known."""
     from nil_mitsuba import sensors
@@ -673,7 +714,7 @@ def test_an_aimed_panoramas_middle_meets_its_target(rgb, kind):
 
     space = nil.space()
     place = mi.Point2f(0.5, 0.25 if eyes else 0.5)
-    p, v, _, _ = Camera(loaded, space, 0.25).start(rays(loaded, place)[0], mi.Float(0.5))
+    p, v, *_ = Camera(loaded, space, 0.25).start(rays(loaded, place)[0], mi.Float(0.5))
     way = (aim.focus_distance - NARROW) / 3.0
     end, _ = geometry.flow(p, space.to_cell_axes(v), mi.Float(way), 2.0)
     there, cell = geometry.wrap(end, 2.0)
