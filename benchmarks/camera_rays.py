@@ -34,7 +34,7 @@ def camera(mi, twist, quotient, tolerance, scene, origin, target, width=WIDTH, m
     index = dr.arange(mi.UInt32, width * width)
     place = mi.Point2f(index % width + 0.5, index // width + 0.5) / width
     ray, _ = sensor.sample_ray_differential(0, 0.5, place, mi.Point2f(0.5))
-    p, v, cone, _ = Camera(sensor, space, tolerance).start(ray, mi.Float(0))
+    p, v, cone, *_ = Camera(sensor, space, tolerance).start(ray, mi.Float(0))
     return tracer, p, v, cone
 
 

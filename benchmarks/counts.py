@@ -86,7 +86,10 @@ def counting():
     from nil_mitsuba.tracer import Tracer
 
     counts = Counts()
-    intersect, occluded = Tracer.intersect, Tracer.occluded
+    intersect = Tracer.intersect
+    # An earlier commit has no obstacles
+    names = [name for name in ("occluded", "obstacle") if hasattr(Tracer, name)]
+    towards_lights = {name: getattr(Tracer, name) for name in names}
 
     def watched(trace, tracer, p, kind, active):
         scene = tracer.scene
@@ -98,21 +101,26 @@ def counting():
         finally:
             tracer.scene = scene
 
-    def counted_intersect(tracer, p, v, cone, reach, active, *time):
+    def counted_intersect(tracer, p, v, cone, reach, active, *time, **ends):
         def trace():
-            return intersect(tracer, p, v, cone, reach, active, *time)
+            return intersect(tracer, p, v, cone, reach, active, *time, **ends)
 
         kind = dr.select(cone.soft, mi.UInt32(KINDS.index("soft")), KINDS.index("seen"))
         return watched(trace, tracer, p, kind, active & (reach > 0))
 
-    def counted_occluded(tracer, p, start, v, cone, reach, active, *time):
-        def trace():
-            return occluded(tracer, p, start, v, cone, reach, active, *time)
+    def counted(shadow):
+        def counted_shadow(tracer, p, start, v, cone, reach, active, *time):
+            def trace():
+                return shadow(tracer, p, start, v, cone, reach, active, *time)
 
-        kind = mi.UInt32(KINDS.index("shadow"))
-        return watched(trace, tracer, p, kind, active & (reach > 0))
+            kind = mi.UInt32(KINDS.index("shadow"))
+            return watched(trace, tracer, p, kind, active & (reach > 0))
 
-    Tracer.intersect, Tracer.occluded = counted_intersect, counted_occluded
+        return counted_shadow
+
+    Tracer.intersect = counted_intersect
+    for name, shadow in towards_lights.items():
+        setattr(Tracer, name, counted(shadow))
     try:
         # Step by step, so that the lanes of a packet can be looked at together
         with (
@@ -121,4 +129,6 @@ def counting():
         ):
             yield counts
     finally:
-        Tracer.intersect, Tracer.occluded = intersect, occluded
+        Tracer.intersect = intersect
+        for name, shadow in towards_lights.items():
+            setattr(Tracer, name, shadow)

@@ -40,9 +40,11 @@ class Camera:
 
     def start(
         self, ray: mi.RayDifferential3f, across: mi.Float
-    ) -> tuple[mi.Point3f, mi.Vector3f, Cone, mi.Float]:
+    ) -> tuple[mi.Point3f, mi.Vector3f, Cone, mi.Float, mi.Vector3f]:
         """Start (cells), frame direction, error cone and length (cells) of a sensor ray (scene).
 
+        The last one is its frame direction before it came to the near clip distance: in that the
+        sensor sees an environment.
         ``across``: the sample's place on the film from its left (0) to its right (1); a batch tells
         its sensors apart by it.
         """
@@ -70,8 +72,9 @@ class Camera:
             p, v = self._through_lens(p, on_plane, ray)
         else:
             p = geometry.multiply(p, self._step(on_plane), space.twist)
+        first = space.to_scene_axes(v)
         p, v = geometry.flow(p, v, near, space.twist)
-        return p, space.to_scene_axes(v), cone, far
+        return p, space.to_scene_axes(v), cone, far, first
 
     def _step(self, v):
         """A vector (scene) as what a point (cells) is multiplied by."""

@@ -43,6 +43,18 @@ def denoise(
     return dr.concat((colour, picture[:, :, 3:]), axis=2) if channels == 4 else colour
 
 
+def through_media(
+    albedo: mi.TensorXf, normal: mi.TensorXf, transmittance: mi.TensorXf
+) -> tuple[mi.TensorXf, mi.TensorXf]:
+    """The guides as they are seen through media: edges and textures fade as they do in the picture.
+
+    All have the shape (height, width, 3). What media scatter has no edges, the albedo 1 and no
+    normal, as what mirrors reflect.
+    """
+    seen = (transmittance[:, :, :1] + transmittance[:, :, 1:2] + transmittance[:, :, 2:]) / 3
+    return 1 + (albedo - 1) * transmittance, normal * seen
+
+
 def _oidn():
     try:
         import mitsuba_oidn

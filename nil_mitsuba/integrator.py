@@ -12,25 +12,13 @@ from . import geometry, parameters
 from .camera import Camera
 from .errors import raising_causes
 from .interaction import offset, surface_interaction
-from .layers import LAYERS, channel_names
-from .lights import Lights, LightSample, lobe_angle
+from .layers import channel_names
+from .lights import LightSample
 from .passes import Passes
 from .quotient import Space, multiply_cells
-from .shapes import ROUNDING, ROUNDINGS, Shapes, name_of
-from .tracer import Cone, Tracer
-
-# After a bounce that scatters into a lobe of one radian, a ray may be off by this angle per pixel
-# of tolerance; its lobe blurs what lies behind it. On the bent Cornell box halving it moves the
-# mean by less than 0.1 % and costs a tenth more time.
-ROUGH_SPREAD = 0.8
-# A lobe narrower than this (radians) is a mirror's for the tracer: hits stay exact behind it.
-SOFT_LOBE = 0.1
-# Behind a rough bounce, the part of a ray's spread by which the next ray's error grows: lobes blur
-# what lies behind them, not the contact that the next ray starts from.
-WIDENING = 0.25
-# Towards a light a ray may be off by the angle that a rough bounce would allow it, times so many
-# half angles of the light: the shadow's edge is as wide as the light.
-PENUMBRA = 3
+from .tracer import Cone
+from .view import View, warn_of_what_is_ignored
+from .volumetric import VolumetricPaths
 
 
 class NilIntegrator(ADIntegrator):
@@ -41,7 +29,7 @@ class NilIntegrator(ADIntegrator):
     ``cell_origin`` (0, 0, 0) and ``cell_size`` (1), in scene units; ``tolerance`` (0.25), in
     pixels; ``max_distance`` of one segment, in cells (12 in the quotient, unlimited in plain Nil);
     ``aovs``, layers to render beside the picture (none of them; a list such as "distance, normal").
-    It offers no gradients and no participating media.
+    Media are those of ``volpath``; it offers no gradients.
     """
 
     _given: dict = {}  # Parameters that are not left to their defaults
@@ -106,7 +94,7 @@ class NilIntegrator(ADIntegrator):
         """The scene as this integrator's parameters show it; ``general`` as of `Space`, ``sensor``
         the one around which empty space is known best."""
         view = View(scene, self, general, sensor)
-        _warn_of_what_is_ignored(scene, view.shapes, self)
+        warn_of_what_is_ignored(view, self)
         return view
 
     def aov_names(self) -> list[str]:
@@ -123,13 +111,15 @@ class NilIntegrator(ADIntegrator):
             mi.LogLevel.Warn,
             "nil: inside another integrator; if that is aov, its own layers are traced straight.",
         )
-        view = View(scene, self)
+        view = View(scene, self, sensor=scene.sensors()[0])
         camera = Camera(scene.sensors()[0], view.space, self.tolerance)
-        p, v, cone, far = camera.start(ray, mi.Float(0))
+        p, v, cone, far, first = camera.start(ray, mi.Float(0))
         # Wrappers shrink the differentials with the sample count; the cone is a whole pixel's.
         scale = math.sqrt(sampler.sample_count())
         cone = Cone(cone.width * scale, cone.spread * scale)
-        radiance, valid, seen = self.trace(view, sampler, ray, p, v, cone, far, mi.Bool(active))
+        radiance, valid, seen = self.trace(
+            view, sampler, ray, p, v, cone, far, first, mi.Bool(active)
+        )
         # What is not seen in the scene is the number of samples: this one
         aovs = [mi.Float(channel) for layer in self.layers for channel in seen.get(layer, [1])]
         return radiance, valid, aovs, None
@@ -156,14 +146,18 @@ class NilIntegrator(ADIntegrator):
         v: mi.Vector3f,
         cone: Cone,
         far: mi.Float,
+        first: mi.Vector3f,
         active: mi.Bool,
     ):
         """Radiance along the geodesics from ``p`` (cells) in frame direction ``v``.
 
-        What lies beyond the length ``far`` (cells) is hidden from the camera. Returns the radiance,
+        What lies beyond the length ``far`` (cells) is hidden from the camera, which sees the
+        environment in the frame direction ``first``. Returns the radiance,
         whether the path met anything that makes its pixel opaque, and the channels of each layer at
         the path's first vertex.
         """
+        if dr.hint(view.media.exist, mode="scalar"):
+            return VolumetricPaths(self, view).trace(sampler, ray, p, v, cone, far, first, active)
         scene, space, tracer = view.scene, view.space, view.tracer
         lights = view.lights
         sampling = self.emitter_sampling and lights.exist
@@ -196,7 +190,7 @@ class NilIntegrator(ADIntegrator):
             p, v, cone, spent = self._beyond_lights(view, ray.time, p, v, cone, far, active)
 
         # What the loop leaves as it is need not be part of its state
-        while dr.hint(active, exclude=[ray, far, spent]):
+        while dr.hint(active, exclude=[ray, far, first, spent]):
             # --------------------- The next vertex ---------------------
 
             start, home = mi.Point3f(p), mi.Vector3i(0)
@@ -204,7 +198,10 @@ class NilIntegrator(ADIntegrator):
                 p, home = geometry.wrap(p, space.twist)
             limit = dr.select(depth == 0, far - spent, tracer.max_distance)
             hit = tracer.intersect(p, v, cone, tracer.reach(p, v, limit), active, ray.time)
-            si = surface_interaction(hit, v, space, ray.wavelengths)
+            v_start = v
+            if dr.hint(not space.flat, mode="scalar"):
+                v_start = dr.select(depth == 0, first, v)
+            si = surface_interaction(hit, v_start, space, ray.wavelengths)
 
             seen = view.see(seen, hit, si, home, spent, active & (depth == 0))
 
@@ -225,8 +222,7 @@ class NilIntegrator(ADIntegrator):
             active_next = (depth + 1 < depth_limit) & si.is_valid()
             bsdf = si.bsdf()
             margin = view.margin(hit, si)
-            growth = dr.select(cone.soft, WIDENING, 1) * cone.spread
-            width = dr.fma(growth, hit.distance, cone.width)
+            width = view.widened(cone, hit.distance)
 
             # --------------------- Emitter sampling ---------------------
 
@@ -255,13 +251,8 @@ class NilIntegrator(ADIntegrator):
                 mis_em = dr.select(light.delta, 1, mis_weight(light.pdf, bsdf_pdf))
                 Lr_dir = β * bsdf_val * light.weight * mis_em
                 active_em &= dr.any(Lr_dir != 0)
-                penumbra = dr.minimum(PENUMBRA * light.angle, 1)
-                spread = dr.select(
-                    cone.soft,
-                    view.rough_spread,
-                    dr.maximum(cone.spread, view.rough_spread * penumbra),
-                )
-                active_em &= self._visible(view, si, margin, light, Cone(width, spread), active_em)
+                shadow = view.shadow_cone(cone, width, light)
+                active_em &= self._visible(view, si, margin, light, shadow, active_em)
                 L += dr.select(active_em, Lr_dir, 0)
 
             # ----------------------- BSDF sampling -----------------------
@@ -279,13 +270,7 @@ class NilIntegrator(ADIntegrator):
             bsdf_pdf_prev = bsdf_sample.pdf
             bsdf_delta_prev = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
 
-            # The pixel's cone goes on growing behind mirrors and glass; a rough lobe widens it.
-            lobe = dr.minimum(lobe_angle(bsdf_sample.pdf), 1)
-            cone.width = width
-            cone.soft |= active_next & ~bsdf_delta_prev & (lobe > SOFT_LOBE)
-            cone.spread = dr.select(
-                bsdf_delta_prev, cone.spread, dr.maximum(cone.spread, view.rough_spread * lobe)
-            )
+            cone = view.scattered(cone, width, bsdf_sample.pdf, ~bsdf_delta_prev)
 
             # --------------------- Stopping criterion ---------------------
 
@@ -336,130 +321,3 @@ class NilIntegrator(ADIntegrator):
             )
             spent = dr.select(active, spent + hit.distance, spent)
         return p, v, cone, spent
-
-
-def _warn_of_what_is_ignored(scene, shapes, integrator):
-    """Log a warning of the shapes outside the quotient's cube, and one each for what of a shape
-    lies nowhere, and for media."""
-    lower = list(integrator.cell_origin)
-    upper = [c + integrator.cell_size for c in lower]
-    margin = 1e-4 * integrator.cell_size  # a wall on a face is inside, whatever was rounded
-    outside = []
-    for shape, extent in zip(shapes.shapes, shapes.extents):
-        if extent.lost:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"nil: of the shape {name_of(shape)}, {extent.lost}: they are never seen.",
-            )
-        reach = 0
-        if integrator.quotient and extent.box.valid():
-            box = extent.box
-            reach = max(max(lower[i] - box.min[i], box.max[i] - upper[i]) for i in range(3))
-        if reach > margin:
-            outside.append((reach, name_of(shape)))
-        if shape.is_medium_transition():
-            mi.Log(mi.LogLevel.Warn, f"nil: the medium of the shape {name_of(shape)} is ignored.")
-    if outside and not integrator.cell_is_known:
-        reach, name = max(outside)
-        others = f" (the farthest of {len(outside)})" if len(outside) > 1 else ""
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"nil: the shape {name} reaches {reach:.4g} scene units out of the cube {lower} to "
-            f"{upper}{others}: what lies outside is never seen. Move it, or set cell_origin and "
-            "cell_size.",
-        )
-    for kind, endpoints in (("sensor", scene.sensors()), ("emitter", scene.emitters())):
-        for endpoint in endpoints:
-            if endpoint.get_medium() is not None:
-                name = f'"{endpoint.id()}"' if endpoint.id() else endpoint.class_name()
-                mi.Log(mi.LogLevel.Warn, f"nil: the medium of the {kind} {name} is ignored.")
-
-
-class View:
-    """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
-
-    def __init__(
-        self,
-        scene: mi.Scene,
-        integrator: NilIntegrator,
-        general: bool = False,
-        sensor: mi.Sensor | None = None,
-    ):
-        if dr.flag(dr.JitFlag.FreezingScope):
-            raise RuntimeError(
-                'the integrator "nil" takes numbers from the scene that a frozen function would '
-                "keep when the scene changes: render without dr.freeze."
-            )
-        self.scene = scene
-        self.space = integrator.space(general)
-        self.shapes = Shapes(scene)
-        focus = None
-        if sensor is not None:
-            to_world = sensor.world_transform().matrix
-            focus = mi.ScalarPoint3f([to_world[i, 3][0] for i in range(3)])
-        self.tracer = Tracer(scene, self.space, integrator.max_distance, self.shapes, focus)
-        self.lights = Lights(scene, self.space, integrator.max_distance)
-        self.rough_spread = dr.opaque(mi.Float, ROUGH_SPREAD * integrator.tolerance)
-        self.layers = [layer for layer in integrator.layers if LAYERS[layer].rule != "count"]
-        if "shape" in self.layers:
-            self._number_shapes()
-
-    def margin(self, hit, si) -> mi.Float:
-        """How far (scene units) off a surface that was hit the next ray starts."""
-        margin = self.shapes.margin(si, hit.preliminary.t)
-        # Cells are counted from the origin
-        return dr.maximum(margin, ROUNDINGS * ROUNDING * self.space.largest)
-
-    def nothing_seen(self) -> dict[str, list]:
-        """The channels of each layer where a path meets nothing."""
-
-        def nothing(layer):
-            mean = LAYERS[layer].rule == "mean"
-            return mi.Float(0) if mean else mi.Int32(-(layer == "shape"))
-
-        return {layer: [nothing(layer) for _ in LAYERS[layer].channels] for layer in self.layers}
-
-    @dr.syntax
-    def see(self, seen, hit, si, home, spent, first):
-        """The channels of each layer after a vertex, which counts where ``first``."""
-        if dr.hint(len(self.layers) > 0, mode="scalar"):
-            first = first & si.is_valid()
-            if first:  # a branch: later vertices need not compute them
-                seen = self._channels_of(hit, si, home, spent, first)
-        return seen
-
-    def _channels_of(self, hit, si, home, spent, first):
-        found = {}
-        for layer in self.layers:
-            if layer == "distance":
-                found[layer] = [(spent + hit.distance) * self.space.size]
-            elif layer == "position":
-                found[layer] = list(si.p)
-            elif layer == "normal":
-                found[layer] = list(si.sh_frame.n)
-            elif layer == "albedo":
-                bsdf = si.bsdf()
-                albedo = bsdf.eval_diffuse_reflectance(si, first)
-                # What only reflects and refracts shows other things' colours: white, for denoisers
-                smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-                if mi.is_spectral:
-                    # Under a light of equal energies. Single samples of a colour may be anything
-                    albedo *= dr.rcp(mi.pdf_rgb_spectrum(si.wavelengths))
-                    rgb = mi.spectrum_to_srgb(albedo, si.wavelengths)
-                else:
-                    rgb = dr.clip(albedo, 0, 1)
-                found[layer] = [dr.select(smooth, rgb[i % len(rgb)], 1) for i in range(3)]
-            elif layer == "cell":
-                found[layer] = list(multiply_cells(home, hit.cell, self.space))
-            elif layer == "shape":
-                shape = dr.select(si.instance == None, si.shape, si.instance)  # noqa: E711
-                number = dr.reinterpret_array(mi.UInt32, shape)
-                found[layer] = [dr.gather(mi.Int32, self.shape_numbers, number, first)]
-        return found
-
-    def _number_shapes(self):
-        pointers = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.scene.shapes()]
-        numbers = [-1] * (max(pointers, default=0) + 1)
-        for number, pointer in enumerate(pointers):
-            numbers[pointer] = number
-        self.shape_numbers = mi.Int32(numbers)

@@ -30,6 +30,9 @@ LAYERS: Mapping[str, Layer] = {
     "position": Layer(("position.X", "position.Y", "position.Z"), "mean", "float32"),
     "normal": Layer(("normal.X", "normal.Y", "normal.Z"), "mean", "float16"),
     "albedo": Layer(("albedo.R", "albedo.G", "albedo.B"), "mean", "float16"),
+    "transmittance": Layer(
+        ("transmittance.R", "transmittance.G", "transmittance.B"), "mean", "float16"
+    ),
     "cell": Layer(("cell.X", "cell.Y", "cell.Z"), "first", "float32"),
     "shape": Layer(("shape.X",), "first", "float32"),
     "samples": Layer(("samples.X",), "count", "float32"),

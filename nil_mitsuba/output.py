@@ -36,7 +36,11 @@ class Output:
         if self.denoise:
             from . import denoise
 
-            image = denoise.denoise(image, *(picture.layers[name] for name in GUIDES))
+            albedo, normal = (picture.layers[name] for name in GUIDES)
+            passed = picture.layers.get("transmittance")
+            if passed is not None:
+                albedo, normal = denoise.through_media(albedo, normal, passed)
+            image = denoise.denoise(image, albedo, normal)
             layers["noisy"] = picture.image[:, :, :3]
         exr.write(
             self.exr,
@@ -67,6 +71,7 @@ def metadata_of(state: Checkpoint) -> dict:
     return {
         **about,
         "sceneHash": settings["scene"],
+        **{key: settings[key] for key in ("fog", "fog_albedo") if key in settings},
         "sensor": settings["sensor"],
         "seed": settings["seed"],
         "spp": state.sums.count * settings["pass_spp"],

@@ -60,7 +60,7 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
         "cell_origin": _point(given, "cell_origin"),
         "cell_size": _positive(given, "cell_size", 1.0),
         "tolerance": _positive(given, "tolerance", 0.25),
-        "max_distance": _positive(given, "max_distance", 12.0) if limited else math.inf,
+        "max_distance": _distance(given, "max_distance") if limited else math.inf,
         "max_depth": max_depth,
         "rr_depth": rr_depth,
         "hide_emitters": _boolean(given, "hide_emitters", False),
@@ -114,6 +114,11 @@ def _positive(given, name, default):
     if value <= 0:
         raise RuntimeError(f'"{name}" must be greater than zero, and it is {value:g}')
     return value
+
+
+def _distance(given, name):
+    # "inf" in a scene file
+    return math.inf if given.get(name) == math.inf else _positive(given, name, 12.0)
 
 
 def _axis(given, name, default):

@@ -21,6 +21,9 @@ VARIANT_MODULES = (
     "nil_mitsuba.interaction",
     "nil_mitsuba.camera",
     "nil_mitsuba.lights",
+    "nil_mitsuba.media",
+    "nil_mitsuba.view",
+    "nil_mitsuba.volumetric",
     "nil_mitsuba.passes",
     "nil_mitsuba.integrator",
 )

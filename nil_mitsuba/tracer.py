@@ -68,7 +68,8 @@ class Hit:
     ``distance`` (cells) is arc length, ``arrival`` the frame direction there (scene axes), ``cell``
     the deck element of the copy that was hit, ``ray`` (scene) and ``preliminary`` what Mitsuba
     needs to compute its surface interaction, ``triangle`` what else is known if the scene has
-    meshes.
+    meshes. ``end`` (cells) is where in its cell a ray is that has met nothing within its reach, if
+    that was asked for.
     """
 
     valid: mi.Bool
@@ -78,6 +79,7 @@ class Hit:
     ray: mi.Ray3f
     preliminary: mi.PreliminaryIntersection3f
     triangle: Triangle | None = None
+    end: mi.Point3f | None = None
 
 
 @dataclass
@@ -381,6 +383,17 @@ class Tracer:
         vertex = dr.select(hit, front.vertex, vertex)
         return Front(vertex, foot, dr.select(hit, front.t, t), cell)
 
+    def _halted(self, front: Front, foot: Foot, chord: Chord, s: mi.Float, hit: mi.Bool) -> Front:
+        """The front at the arc length ``s`` of a chord that has ``hit``; ``foot`` is at its end."""
+        if self.space.quotient:
+            at = front.foot.point  # there already
+        else:
+            at = dr.select(
+                hit, foot.moved(s - chord.length, self.space.twist).point, front.foot.point
+            )
+        foot = Foot(at, front.foot.direction, front.foot.lost)
+        return Front(front.vertex, foot, dr.select(hit, front.t + s, front.t), front.cell)
+
     def intersect(
         self,
         p: mi.Point3f,
@@ -389,9 +402,10 @@ class Tracer:
         reach: mi.Float,
         active: mi.Bool,
         time: mi.Float = 0,
+        ends: bool = False,
     ) -> Hit:
         """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` (scene axes) within
-        ``reach``.
+        ``reach``; if ``ends``, in the quotient also where those come to that meet nothing.
 
         In the quotient ``p`` lies in the unit cube. A hit of a ray that is seen lies off the
         geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more; where the geodesic
@@ -401,7 +415,7 @@ class Tracer:
         if self.space.flat and not self.space.quotient:
             hit = self._straight(p, v, reach, active, time)
         else:
-            hit = self._along_chords(p, v, cone, reach, active, time)
+            hit = self._along_chords(p, v, cone, reach, active, time, ends)
         hit.arrival = self.space.to_scene_axes(hit.arrival)
         hit.preliminary = self.shapes.within_splines(hit.preliminary, hit.ray)
         return hit
@@ -417,7 +431,7 @@ class Tracer:
         return Hit(valid, distance, mi.Vector3f(v), mi.Vector3i(0), ray, found, triangle)
 
     @dr.syntax
-    def _along_chords(self, p, v, cone, reach, active, time):
+    def _along_chords(self, p, v, cone, reach, active, time, ends):
         """`intersect` by chords."""
         space, scene = self.space, self.scene
         k = space.twist
@@ -453,6 +467,9 @@ class Tracer:
                     length = smaller(length, chords.longest)
                     lift = dr.select(leaps, corner(h), lift)
                     querying &= ~leaps
+                if dr.hint(ends, mode="scalar"):
+                    # What is there has to be on the side of all surfaces on which the chord ends
+                    lift = dr.select(length >= reach - front.t, 0, lift)
                 length = smaller(length, reach - front.t)
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
@@ -500,7 +517,10 @@ class Tracer:
         arrival = geometry.turned(v, k * v.z * distance)
         distance = dr.select(valid, distance, dr.inf)
         triangle = self.triangles.at(found)
-        return Hit(valid, distance, arrival, front.cell, line_ray(o, d, time), found, triangle)
+        hit = Hit(valid, distance, arrival, front.cell, line_ray(o, d, time), found, triangle)
+        if dr.hint(ends and quotient, mode="scalar"):
+            hit.end = front.foot.point
+        return hit
 
     @dr.syntax
     def _onto_geodesic(self, found, o, d, foot, distance, chord, cone, chords, reach, time):
@@ -593,17 +613,55 @@ class Tracer:
         """
         v = self.space.to_cell_axes(v)
         if self.space.flat and not self.space.quotient:
-            space = self.space
-            along = dr.fma(reach, v, mi.Vector3f(p - start))
-            length = dr.norm(along)
-            d = space.to_scene_axes(along / length)
-            ray = line_ray(space.to_scene(start), d, time, length * space.size)
+            ray, _ = self._straight_to_end(p, start, v, reach, time)
             return self.scene.ray_test(ray, coherent=False, active=active & (reach > 0))
-        return self._chords_meet(p, start, v, cone, reach, active, time)
+        return self._chords_meet(p, start, v, cone, reach, active, time, finds=False)[0]
+
+    def obstacle(
+        self,
+        p: mi.Point3f,
+        start: mi.Point3f,
+        v: mi.Vector3f,
+        cone: Cone,
+        reach: mi.Float,
+        active: mi.Bool,
+        time: mi.Float = 0,
+    ) -> Hit:
+        """What first stands in the way of the geodesic, as of `occluded`; its ``end`` is the point
+        of the geodesic itself that is there."""
+        space = self.space
+        v = space.to_cell_axes(v)
+        if space.flat and not space.quotient:
+            ray, length = self._straight_to_end(p, start, v, reach, time)
+            active = active & (reach > 0)
+            found = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            valid, part = found.is_valid(), found.t * space.cells_per_unit / length
+            distance = dr.select(valid, smaller(part, 1) * reach, dr.inf)
+            arrival, cell = mi.Vector3f(v), mi.Vector3i(0)
+            end = mi.Point3f(dr.fma(dr.select(valid, distance, 0), v, p))
+        else:
+            valid, front, ray, found = self._chords_meet(
+                p, start, v, cone, reach, active, time, finds=True
+            )
+            distance = dr.select(valid, front.t, dr.inf)
+            arrival = geometry.turned(v, space.twist * v.z * front.t)
+            end, cell = front.foot.point, front.cell
+        arrival = space.to_scene_axes(arrival)
+        found = self.shapes.within_splines(found, ray)
+        return Hit(valid, distance, arrival, cell, ray, found, self.triangles.at(found), end)
+
+    def _straight_to_end(self, p, start, v, reach, time):
+        """The ray of `occluded` in Euclidean space, and its length (cells)."""
+        space = self.space
+        along = dr.fma(reach, v, mi.Vector3f(p - start))
+        length = dr.norm(along)
+        d = space.to_scene_axes(along / length)
+        return line_ray(space.to_scene(start), d, time, length * space.size), length
 
     @dr.syntax
-    def _chords_meet(self, p, start, v, cone, reach, active, time):
-        """`occluded` by chords."""
+    def _chords_meet(self, p, start, v, cone, reach, active, time, finds):
+        """`occluded` by chords, or `obstacle` if it ``finds`` what that is: whether there is one,
+        the front there, and the ray that has met it with what that is."""
         space, scene = self.space, self.scene
         quotient = space.quotient
         chords = Chords(v, space.twist, cone, SHADOW_SAGITTA, 0, self.least)
@@ -611,6 +669,7 @@ class Tracer:
         front = self._start(start, p, v)
         blocked = mi.Bool(False)
         active = active & (reach > 0)
+        found, met = dr.zeros(mi.PreliminaryIntersection3f), dr.zeros(mi.Ray3f)
 
         while active:
             if not quotient:
@@ -631,12 +690,20 @@ class Tracer:
                 s = part * chord.length
                 before = dr.select(front.t > 0, self.overlap, 0)
                 ray = self._ray(front, chord, before, s + dr.select(last, 0, self.overlap), time)
-                hit = scene.ray_test(ray, coherent=False, active=searching)
+                if dr.hint(finds, mode="scalar"):
+                    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=searching)
+                    hit = pi.is_valid()
+                    found, met = dr.select(hit, pi, found), dr.select(hit, ray, met)
+                    s = dr.select(hit, self._passed(chord, pi, before), s)
+                else:
+                    hit = scene.ray_test(ray, coherent=False, active=searching)
                 blocked |= hit
                 front = self._onward(front, chord, foot, part, s, face, hit)
+                if dr.hint(finds, mode="scalar"):
+                    front = self._halted(front, foot, chord, s, hit)
                 active &= ~hit & ~last
                 searching &= active & (front.t < reach)
                 if not quotient:
                     searching &= ~self.occupied.excludes(front.vertex)
             active &= front.t < reach
-        return blocked
+        return blocked, front, met, found

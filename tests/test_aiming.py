@@ -25,7 +25,7 @@ def central(sensor, integrator, lens=None):
     lens = mi.Point2f(0.5) if lens is None else lens
     ray, _ = sensor.sample_ray_differential(0, 0.5, mi.Point2f(0.5), lens)
     space = integrator.space()
-    p, v, _, _ = Camera(sensor, space, integrator.tolerance).start(ray, mi.Float(0.5))
+    p, v, *_ = Camera(sensor, space, integrator.tolerance).start(ray, mi.Float(0.5))
     return p, space.to_cell_axes(v)
 
 

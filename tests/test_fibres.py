@@ -326,7 +326,7 @@ def test_rays_through_a_lens_and_their_reach_turn_with_the_scene(rgb, fibres):
         random = mi.PCG32(count)
         u, w = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(2))
         ray, _ = scene.sensors()[0].sample_ray_differential(0, 0.5, u, w)
-        p, v, _, _ = Camera(scene.sensors()[0], space, 0.25).start(ray, mi.Float(0))
+        p, v, *_ = Camera(scene.sensors()[0], space, 0.25).start(ray, mi.Float(0))
         reach = Tracer(scene, space, dr.inf).reach(p, v)
         found.append((p, turned_back(axis, v), reach))
     for a, b in zip(*found):

@@ -287,8 +287,8 @@ def test_every_image_within_the_distance_can_be_chosen(rgb, twist, max_distance)
 
 def visible(scene, integrator, si, found):
     """Whether nothing stands between the points and the light drawn for them."""
-    from nil_mitsuba.integrator import View
     from nil_mitsuba.tracer import Cone
+    from nil_mitsuba.view import View
 
     active = mi.Bool(found.weight[0] > 0) & (dr.dot(si.n, found.direction) > 0)
     margin = mi.Float(2e-6)  # of a surface that no shape has

@@ -1,7 +1,6 @@
 """How sentences name what has no name of its own."""
 
 import mitsuba as mi
-import pytest
 
 from nil_mitsuba.shapes import name_of
 
@@ -50,33 +49,14 @@ def test_a_mesh_of_many_files_has_a_name_that_one_can_read(rgb, tmp_path):
     assert len(name_of(merged)) < 100 and name_of(merged).startswith('Mesh "one.obj + one.obj')
 
 
-def test_a_warning_names_the_sensor_whose_medium_is_ignored(rgb, capfd):
-    fog = {"type": "homogeneous", "sigma_t": 1.0}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sky": {"type": "constant"},
-            "camera": {
-                "type": "perspective",
-                "film": {"type": "hdrfilm", "width": 2, "height": 2},
-                "fog": fog,
-            },
-        }
-    )
-    mi.render(scene, integrator=mi.load_dict({"type": "nil"}), spp=1)
-    assert 'nil: the medium of the sensor "camera" is ignored.' in capfd.readouterr().out
-
-
-@pytest.mark.parametrize("medium", [False, True])
-def test_a_warning_names_a_shape_without_an_id(rgb, tmp_path, capfd, medium):
-    inside = '<medium type="homogeneous" name="interior"/>' if medium else ""
-    place = "0.5, 0.5, 0.5" if medium else "0.5, 0.5, 3"
+def test_a_warning_names_a_shape_without_an_id(rgb, tmp_path, capfd):
+    place = "0.5, 0.5, 3"
     (tmp_path / "scene.xml").write_text(
         '<scene version="3.0.0"><integrator type="nil"/><sensor type="perspective">'
         '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/>'
         '</film></sensor><emitter type="constant"/>'
         f'<shape type="sphere"><point name="center" value="{place}"/>'
-        f'<float name="radius" value="0.1"/>{inside}</shape></scene>'
+        '<float name="radius" value="0.1"/></shape></scene>'
     )
     mi.render(mi.load_file(str(tmp_path / "scene.xml")), spp=1)
     out, err = capfd.readouterr()

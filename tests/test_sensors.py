@@ -40,7 +40,7 @@ def start(description, twist=1.0, quotient=False, origin=(0, 0, 0), size=1.0, le
     lens = mi.Point2f(0.5) if lens is None else lens
     ray, _ = loaded.sample_ray_differential(0, 0.5, place, lens)
     camera = Camera(loaded, Space(twist, quotient, list(origin), size), 0.25)
-    p, v, cone, _ = camera.start(ray, place.x)
+    p, v, cone, *_ = camera.start(ray, place.x)
     return ray, p, v, cone
 
 

@@ -225,7 +225,7 @@ def look_at(scene, twist, quotient):
     space = Space(twist, quotient, [0.0, 0.0, 0.0], 1.0)
     sensor = scene.sensors()[0]
     ray, _ = sensor.sample_ray_differential(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    p, v, cone, _ = Camera(sensor, space, 0.25).start(ray, mi.Float(0))
+    p, v, cone, *_ = Camera(sensor, space, 0.25).start(ray, mi.Float(0))
     tracer = Tracer(scene, space, 12.0)
     hit = tracer.intersect(mi.Point3f(p), v, cone, tracer.reach(p, v), mi.Bool(True))
     assert hit.valid[0]

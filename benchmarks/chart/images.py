@@ -7,7 +7,7 @@ from unittest import mock
 import drjit as dr
 import mitsuba as mi
 
-from nil_mitsuba import integrator
+from nil_mitsuba import view
 
 from .. import truth
 from ..flip import flip
@@ -102,7 +102,7 @@ def rendered(scene, setup, method, knob, spp, seed):
     def tracer(scene, space, max_distance, shapes, focus):
         return tracer_of(method, knob, scene, space, max_distance, shapes, focus)
 
-    with mock.patch.object(integrator, "Tracer", tracer):
+    with mock.patch.object(view, "Tracer", tracer):
         return timed(lambda: mi.render(scene, integrator=renderer, spp=spp, seed=seed))
 
 

@@ -51,7 +51,7 @@ class CameraRays:
         place = mi.Point2f(index % width + 0.5, index // width + 0.5) / width
         ray, _ = sensor.sample_ray_differential(0, 0.5, place, mi.Point2f(0.5))
         # The cone of a tolerance of one pixel
-        p, self.v, self.cone, _ = Camera(sensor, self.space, 1.0).start(ray, mi.Float(0))
+        p, self.v, self.cone, *_ = Camera(sensor, self.space, 1.0).start(ray, mi.Float(0))
         self.p = mi.Point3f(p)
         dr.eval(self.p, self.v, self.cone)
 

@@ -325,9 +325,9 @@ def thin_walls(thickness):
 
 def rendered(scene, integrator, spp, make=package):
     """Values of an image whose rays and shadow rays are traced by a tracer that ``make`` makes."""
-    import nil_mitsuba.integrator
+    import nil_mitsuba.view
 
-    with mock.patch.object(nil_mitsuba.integrator, "Tracer", make):
+    with mock.patch.object(nil_mitsuba.view, "Tracer", make):
         image = mi.render(mi.load_dict({"type": "scene", **scene}), integrator=integrator, spp=spp)
         dr.eval(image)
     return image.array
