@@ -25,6 +25,7 @@ import mitsuba as mi
 from . import __version__, aiming, checkpoint, exr, jobs, png, stills
 from .errors import cause_of
 from .fitting import FITS, cut_off
+from .fog import ALBEDO, MOST, Fog
 from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .parameters import nearest
@@ -201,6 +202,8 @@ class RenderOptions(PictureOptions):
     verbose: int
     properties: tuple[tuple[str, str], ...]
     fit: str | None
+    fog: float | None
+    fog_albedo: float | None
 
     def note(self, sentence: str) -> None:
         """Say something that is no error."""
@@ -233,6 +236,7 @@ class RenderOptions(PictureOptions):
             pass_spp,
             denoise=self.denoise,
             fit=self.fit,
+            fog=_fog(self.fog, self.fog_albedo),
         )
 
 
@@ -332,6 +336,20 @@ def scene_options(command):
                 help="Fit the cell to the shapes, or to the shapes and the camera; in plain Nil "
                 "with its origin halfway between those. Say what it is, and what else to do.",
             ),
+            click.option(
+                "--fog",
+                type=Range(0, MOST),
+                metavar="DENSITY",
+                help="Fill the space of a scene without media with fog that light crosses for "
+                "1/DENSITY cells in the mean, such as 0.15.",
+            ),
+            click.option(
+                "--fog-albedo",
+                type=Range(0, 1),
+                metavar="ALBEDO",
+                help="The part of that light that fog scatters; the rest it absorbs.  "
+                f"[default: {ALBEDO:g}]",
+            ),
         )
     ):
         command = option(command)
@@ -406,7 +424,7 @@ def render(**options):
 @click.option("--from", "origin", type=Triple(), help="Where from, if not from the sensor.")
 @click.option("--up", type=Triple(), help="What is to be upright, if not what the sensor holds so.")
 @scene_options
-def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
+def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit, fog, fog_albedo):
     """Print the XML of a camera that looks at something, and how far that is.
 
     It takes the place of the sensor's to_world and focus_distance. Geodesics bend: the look_at of a
@@ -419,7 +437,15 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit):
         )
     _scene_path(scene)
     _set_variant(mode)
-    job = jobs.Job(scene, mode, dict(define), dict(properties), sensor, fit=fit)
+    job = jobs.Job(
+        scene,
+        mode,
+        dict(define),
+        dict(properties),
+        sensor,
+        fit=fit,
+        fog=_fog(fog, fog_albedo),
+    )
     opened = jobs.open_scene(job, _note, aiming=True)
     camera = opened.scene.sensors()[sensor]
     if camera.class_name() == "BatchSensor":
@@ -709,6 +735,7 @@ def _render_in_one_go(
     spp = job.spp or scene.sensors()[job.sensor].sampler().sample_count()
     metadata = about | {
         "sceneHash": job.scene_hash,
+        **(job.fog.settings if job.fog else {}),
         "spp": spp,
         "seed": job.seed,
         "sensor": job.sensor,
@@ -872,6 +899,15 @@ def _paths(scene: Path, options: RenderOptions) -> Paths:
         _output_path(options.png, ".png", "--png") if options.png else None,
         _output_path(options.checkpoint or exr_path.with_suffix(SUMS), SUMS, "--checkpoint"),
     )
+
+
+def _fog(density: float | None, albedo: float | None) -> Fog | None:
+    """The fog of two options, of which the second needs the first."""
+    if density is None:
+        if albedo is not None:
+            raise click.UsageError("--fog-albedo goes with --fog, which says how dense the fog is.")
+        return None
+    return Fog(density) if albedo is None else Fog(density, albedo)
 
 
 def _scene_path(name: str) -> Path:

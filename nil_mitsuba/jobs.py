@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .fitting import fit, unfitted
+from .fog import Fog
 from .layers import GUIDES
 from .scene_files import SceneFiles
 from .stills import Rules, Still
@@ -31,7 +32,7 @@ class Job:
     and of a pass) may be None, for the scene's and for as many as fit; ``scene_hash`` too, for
     whatever lies there. ``denoise`` asks for what denoising needs: a film with the filter "box" and
     the layers that guide it. ``fit`` names what the cell is fitted to, as in ``fitting.FITS``;
-    None leaves it as it is.
+    None leaves it as it is. ``fog`` fills the space around the sensors, if it is not None.
     """
 
     path: str
@@ -45,6 +46,7 @@ class Job:
     scene_hash: str | None = None
     denoise: bool = False
     fit: str | None = None
+    fog: Fog | None = None
 
 
 class Opened(NamedTuple):
@@ -65,7 +67,14 @@ class Opened(NamedTuple):
         """What is to be rendered; raises ValueError if the integrator is not "nil" itself."""
         job = self.job
         return Still(
-            self.scene, job.sensor, self.integrator, job.seed, rules, job.pass_spp, job.scene_hash
+            self.scene,
+            job.sensor,
+            self.integrator,
+            job.seed,
+            rules,
+            job.pass_spp,
+            job.scene_hash,
+            job.fog,
         )
 
 
@@ -88,6 +97,12 @@ def open_scene(
         for sentence in files.notes:
             note(sentence)
 
+        media = files.media()
+        if job.fog and media:
+            raise ValueError(
+                f'--fog is for scenes without a medium, and "{job.path}" has "{media[0]}": leave '
+                "--fog away, or the medium."
+            )
         # The integrator's parameters are checked before large meshes are loaded
         integrator = files.integrator()
         scene_hash = files.hash
@@ -115,6 +130,7 @@ def open_scene(
                 )
             fitted = fit(scene, sensors[job.sensor], files.nil(), job.fit)
             further |= fitted.properties
+            integrator = files.integrator(**further)
             for sentence in fitted.notes:
                 note(sentence)
             if fitted.aim and not aiming:
@@ -123,9 +139,17 @@ def open_scene(
             advice = unfitted(scene, sensors[job.sensor], files.nil())
             if advice:
                 note(f"{job.path}: {advice}")
+        if job.fog:
+            # Cells are as large as they have been fitted
+            note(job.fog.fill(scene, files.nil()))
         if job.denoise:
-            further["aovs"] = ",".join(dict.fromkeys((*layers, *GUIDES)))
-        if further:
+            from .media import has_media  # needs a variant
+
+            guides = (
+                *GUIDES,
+                *(["transmittance"] if has_media(scene, sensors[job.sensor]) else []),
+            )
+            further["aovs"] = ",".join(dict.fromkeys((*layers, *guides)))
             integrator = files.integrator(**further)
         if advice and hasattr(integrator, "view"):
             integrator.cell_is_known = True

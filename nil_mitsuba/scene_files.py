@@ -95,6 +95,11 @@ class SceneFiles:
                 '"box", since noise that pixels share cannot be removed.'
             )
 
+    def media(self) -> list[str]:
+        """What tells each medium of the scene: its id, or its type where it has none."""
+        all_props = (node.props for node in self.rest.nodes if node.type == mi.ObjectType.Medium)
+        return [props.id() or props.plugin_name() for props in all_props]
+
     def scene(self, merge: bool = True):
         """The scene without its integrator; ``merge`` makes one mesh of many, which is faster."""
         if merge:

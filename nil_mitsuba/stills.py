@@ -26,6 +26,7 @@ import mitsuba as mi
 
 from . import __version__, checkpoint, parameters
 from .checkpoint import Checkpoint
+from .fog import Fog
 from .layers import LAYERS, channel_names
 from .sums import Sums, develop, luminance, name_noise
 
@@ -106,8 +107,9 @@ class Interrupted(KeyboardInterrupt):
 class Still:
     """An image of a scene that is rendered in passes.
 
-    ``settings`` is what has to be equal for sums of passes to belong together. Raises ValueError
-    if the integrator is not "nil" itself, which renders passes.
+    ``settings`` is what has to be equal for sums of passes to belong together; ``fog`` is what of
+    the scene a given ``scene_hash`` does not cover. Raises ValueError if the integrator is not
+    "nil" itself, which renders passes.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class Still:
         rules: Rules = Rules(),
         pass_spp: int | None = None,
         scene_hash: str | None = None,
+        fog: Fog | None = None,
     ):
         from .passes import Passes  # of the current variant
 
@@ -150,6 +153,7 @@ class Still:
         self.rules = rules
         self.settings = {
             "scene": scene_hash or hash_of(scene),
+            **(fog.settings if fog else {}),
             "sensor": name,
             "seed": seed,
             "pass_spp": self.passes.spp,
@@ -532,11 +536,13 @@ def hash_of(thing: mi.Scene | mi.Sensor) -> str:
     is all that a batch says of itself: its sensors are asked.
     """
     traversed = mi.traverse(thing)
-    sensors = [node for node in traversed.hierarchy if isinstance(node, mi.Sensor)]
+    # Sensors do not describe their media, nor media their phase functions
+    kinds = (mi.Sensor, mi.Medium, mi.PhaseFunction)
+    nodes = [node for node in traversed.hierarchy if isinstance(node, kinds)]
     text = re.sub(
         r"\b(base_seed|sample_count|samples_per_wavefront|wavefront_size) = \d+|\[0x[0-9a-f]+\]",
         "",
-        "\n".join(map(str, (thing, *sensors))),
+        "\n".join(map(str, (thing, *nodes))),
     )
     digest = hashlib.sha256(text.encode())
     for key in sorted(traversed.keys()):

@@ -15,6 +15,7 @@ import pytest
 
 from conftest import ENVIRONMENT
 from nil_mitsuba import look_at
+from nil_mitsuba.fog import Fog
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -133,6 +134,14 @@ def test_the_first_scene_is_aimed_at_its_ball(rgb):
     aim = look_at(scene, [0.1, 0.1, 0.6], [0.5, 0.5, 0.5])
     placed = scene.sensors()[0].world_transform().matrix
     assert dr.allclose(placed, mi.Matrix4f(aim.to_world.matrix), atol=1e-3)
+
+
+def test_the_lines_of_air_are_those_of_fog(rgb):
+    first, air = blocks("xml")[:2]
+    scene = mi.load_string(first)
+    assert " ".join(air.split()) in " ".join(Fog(0.15).fill(scene, scene.integrator()).split())
+    scene = mi.load_string(first.replace("</sensor>", f"{air}</sensor>"))
+    assert scene.sensors()[0].get_medium() is not None
 
 
 @pytest.mark.parametrize("text", blocks("xml"))
