@@ -36,6 +36,8 @@ STILLS = {
     "fibres": ["--spp", "24"],
     "materials": ["--spp", "24"],
     "lattice": ["--spp", "16"],
+    "lantern": ["--spp", "144", "--filmic", "--exposure", "-0.5"],
+    "dusk": ["--spp", "48", "--filmic"],
     "showcase": ["-D", "resx=1280", "-D", "resy=720", "--spp", "64"],
 }
 

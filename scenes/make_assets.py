@@ -379,6 +379,29 @@ def lamps():
         write_mesh(f"{name}.ply", *join(parts))
 
 
+def lantern(name, windows=8, latitude=17, half=4.5):
+    """Write a sphere of radius 1 that is pierced by a ring of windows at a latitude in degrees.
+
+    A window reaches ``half`` degrees to each side of its middle, in latitude and in longitude.
+    """
+    window, wall = 2 * half, 360 / windows - 2 * half
+    steps = [window, *[wall / 4] * 4] * windows
+    longitudes = [sum(steps[:i]) - half for i in range(len(steps))]
+    lower, upper = latitude - half, latitude + half
+    latitudes = [-90 + (lower + 90) * i / 16 for i in range(16)]
+    latitudes += [lower, *(upper + (90 - upper) * i / 12 for i in range(13))]
+    rings = []
+    for angle in map(math.radians, latitudes):
+        # A ring of radius 0 would have triangles without area, and so no normals.
+        r, z = max(math.cos(angle), 1e-4), math.sin(angle)
+        rings.append([(r * math.cos(a), r * math.sin(a), z) for a in map(math.radians, longitudes)])
+    points, faces = tube(rings)
+    # A quad is two triangles in a row; every fifth one of the ring from `lower` is a window.
+    pierced = range(2 * 16 * len(steps), 2 * 17 * len(steps))
+    faces = [f for i, f in enumerate(faces) if i not in pierced or i // 2 % 5]
+    write_mesh(name, points, faces)
+
+
 def winding_floor(name, size=56):
     """Write a floor that the glued cube carries on without a seam, but for one axis.
 
@@ -450,6 +473,7 @@ if __name__ == "__main__":
     arches("arches.ply")
     island()
     lamps()
+    lantern("lantern.ply")
     winding_floor("winding-floor.ply")
     sky(
         "evening.exr",
