@@ -1,9 +1,10 @@
 """How much emitter sampling along geodesics is worth, and how well it chooses among images.
 
-Prints, for a small light in the quotient and for the bent Cornell box, the relative MSE of BSDF
-sampling alone over that with emitter sampling at equal time; and, for several receivers and lights,
-the variance of the choice of one image of the light against that of an oracle, which knows the
-light of every image within the distance and chooses in proportion to it.
+Prints, for a small light in the quotient, clear and in fog, and for the bent Cornell box, the
+relative MSE of BSDF and phase sampling alone over that with emitter sampling at equal time; and,
+for several receivers and lights, the variance of the choice of one image of the light against that
+of an oracle, which knows the light of every image within the distance and chooses in proportion to
+it.
 """
 
 from __future__ import annotations
@@ -59,6 +60,14 @@ def small_light():
             },
         }
     ), {"twist": 1.0, "quotient": True, "max_depth": 6}
+
+
+def small_light_in_fog():
+    """The same with a mean free path of one cell."""
+    scene, parameters = small_light()
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.8}
+    scene.sensors()[0].set_medium(mi.load_dict(fog))
+    return scene, parameters
 
 
 def bent_cornell_box():
@@ -171,6 +180,7 @@ def main():
 
     print("relative MSE")
     compare_at_equal_time("small light in the quotient", small_light, 10, quick)
+    compare_at_equal_time("the same in fog", small_light_in_fog, 10, quick)
     compare_at_equal_time("bent Cornell box", bent_cornell_box, 3, quick)
 
     print(

@@ -15,6 +15,7 @@ import pathlib
 import subprocess
 import tempfile
 import time
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -174,8 +175,8 @@ def traced_length(scene):
     intersect = Tracer.intersect
     sums = dr.zeros(mi.Float, 2)
 
-    def counted(tracer, p, v, cone, reach, active, time=0):
-        hit = intersect(tracer, p, v, cone, reach, active, time)
+    def counted(tracer, p, v, cone, reach, active, time=0, **options):
+        hit = intersect(tracer, p, v, cone, reach, active, time, **options)
         length = dr.minimum(hit.distance, reach)
         for i, value in enumerate((length, mi.Float(1))):
             dr.scatter_reduce(dr.ReduceOp.Add, sums, value, mi.UInt32(i), active)
@@ -218,11 +219,27 @@ def lattice(quick):
     return {f"twist {twist}": Render(small_lattice(width, twist), spp) for twist in (0, 1)}
 
 
+def still(name, medium, distance, size):
+    """A scene of the gallery in another medium, or in none, seen up to a distance in cells."""
+    folder = ROOT / "scenes"
+    root = ElementTree.parse(folder / f"{name}.xml").getroot()
+    for sensor in root.iter("sensor"):
+        for own in sensor.findall("medium"):
+            sensor.remove(own)
+    mi.file_resolver().append(str(folder))
+    scene = mi.load_string(ElementTree.tostring(root, encoding="unicode"), **size)
+    if medium:
+        scene.sensors()[0].set_medium(mi.load_dict(medium))
+    scene.integrator().max_distance = distance
+    return scene
+
+
 def stills(quick):
+    """In a vacuum, which they once were."""
     # Not much smaller than they are shown: chords are as short as pixels are small
     size = {"resx": 32, "resy": 18} if quick else {"resx": 640, "resy": 360}
     return {
-        name: Render(mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), **size), 2 if quick else 4)
+        name: Render(still(name, None, 12.0, size), 2 if quick else 4)
         for name in ("lattice", "showcase")
     }
 
@@ -242,6 +259,64 @@ def triangles(quick):
     return {
         f"{count:,}": Render(bumpy_scene(count // part), spp)
         for count in (10_000, 100_000, 1_000_000)
+    }
+
+
+def foggy(width, integrator, **medium):
+    """A block of fog over a ground, a ball and a lamp in it, another ball beside it; a sky."""
+    at = mi.ScalarTransform4f
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator | {"max_depth": 8},
+            "sky": {"type": "constant", "radiance": 0.3},
+            "lamp": {"type": "point", "position": [0.5, -0.6, 0.7], "intensity": 2.0},
+            "sensor": camera(width, (0, -3.5, 0.4), (0, 0, 0), 50),
+            "ground": {"type": "rectangle", "to_world": at().translate([0, 0, -1.01]).scale(2)},
+            "ball": {"type": "sphere", "center": [0.2, 0, 0], "radius": 0.35},
+            "beside": {"type": "sphere", "center": [-1.4, 0, -0.7], "radius": 0.3},
+            "block": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
+        }
+    )
+
+
+def homogeneous():
+    return {"type": "homogeneous", "albedo": 0.8, "phase": {"type": "hg", "g": 0.5}}
+
+
+def heterogeneous():
+    at = mi.ScalarTransform4f
+    density = mi.TensorXf([0.1, 1, 0.3, 0.5, 0.2, 0.9, 0, 1], (2, 2, 2))
+    grid = {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(density),
+        "to_world": at().translate([-1, -1, -1]).scale(2),
+    }
+    return {"type": "heterogeneous", "albedo": 0.8, "scale": 3.0, "sigma_t": grid}
+
+
+def fog(medium):
+    def workload(quick):
+        width, spp = (16, 4) if quick else (64, 256)
+        found = {"volpath": {"type": "volpath"}}
+        found |= {f"twist {twist}": PLAIN | {"twist": twist} for twist in (0.0, 1.0)}
+        return {
+            name.removesuffix(".0"): Render(foggy(width, integrator, **medium()), spp)
+            for name, integrator in found.items()
+        }
+
+    return workload
+
+
+def lattice_in_fog(quick):
+    """`lattice` with the mean free path of two cells and the albedo ½, as far as rays go."""
+    size = {"resx": 32, "resy": 18} if quick else {"resx": 320, "resy": 180}
+    fog = {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.5}
+    return {
+        name: Render(
+            still("lattice", fog if name != "clear" else None, distance, size), 2 if quick else 16
+        )
+        for name, distance in (("clear", 12.0), ("foggy", 12.0), ("endless", math.inf))
     }
 
 
@@ -372,6 +447,9 @@ WORKLOADS = {
     "dense": dense,
     "triangles": triangles,
     "grounds": grounds,
+    "fog": fog(homogeneous),
+    "cloud": fog(heterogeneous),
+    "lattice in fog": lattice_in_fog,
     "fresh": fresh,
     "passes": passes,
 }
