@@ -181,6 +181,7 @@ class NilIntegrator(ADIntegrator):
         vertex_prev     = mi.Point3f(p)        # Its position (cells)
         bsdf_pdf_prev   = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
+        sky             = mi.Vector3f(first)   # Direction before surfaces that turn no light
         spent           = mi.Float(0)          # Length of the camera segment before hidden lights
         far             = dr.minimum(far, tracer.max_distance)
         seen            = view.nothing_seen()  # Layers
@@ -199,7 +200,9 @@ class NilIntegrator(ADIntegrator):
             limit = dr.select(depth == 0, far - spent, tracer.max_distance)
             hit = tracer.intersect(p, v, cone, tracer.reach(p, v, limit), active, ray.time)
             v_start = v
-            if dr.hint(not space.flat, mode="scalar"):
+            if dr.hint(view.passable, mode="scalar"):
+                v_start = sky
+            elif dr.hint(not space.flat, mode="scalar"):
                 v_start = dr.select(depth == 0, first, v)
             si = surface_interaction(hit, v_start, space, ray.wavelengths)
 
@@ -264,6 +267,10 @@ class NilIntegrator(ADIntegrator):
             valid |= (
                 active & si.is_valid() & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
             )
+
+            if dr.hint(view.passable, mode="scalar"):
+                straight = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+                sky = dr.select(straight, sky, v)
 
             # Information about the current vertex needed by the next iteration
             vertex_prev = space.to_cells(si.p)

@@ -38,7 +38,6 @@ class Media:
 
     ``exist``: whether there are any. ``coloured``: whether any has an extinction that differs by
     channel or wavelength, so that the one by which lengths are drawn has to be told from others.
-    ``passable``: whether light goes straight through any surface, as through a medium's boundary.
     ``on_faces``: whether any boundary lies on a face of the quotient's cell.
     """
 
@@ -56,9 +55,6 @@ class Media:
         for medium in boxes:
             _check_coefficients(medium)
         self.coloured = any(is_coloured(medium) for medium in boxes)
-        self.passable = any(
-            mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in _nodes(scene, mi.BSDF)
-        )
         faces = [[0, edge] for edge in space.EDGES]
         self.on_faces = space.quotient and any(
             abs(end - face) < NEAR
@@ -468,12 +464,24 @@ def has_media(scene: mi.Scene, sensor: mi.Sensor) -> bool:
     return _around(sensor) is not None or any(map(_media_of, _boundaries(scene)))
 
 
-def _boundaries(scene):
-    """The shapes that may be boundaries of media, those in shapegroups included."""
+def is_passable(scene: mi.Scene) -> bool:
+    """Whether light goes straight through any surface, as through a medium's boundary."""
+    return any(
+        shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+        for shape in _shapes(scene)
+    )
+
+
+def _shapes(scene):
+    """A scene's shapes, those in shapegroups included."""
     shapes = scene.shapes()
-    if any(shape.class_name() == "Instance" for shape in shapes):
-        return _nodes(scene, mi.Shape)
-    return [shape for shape in shapes if shape.is_medium_transition()]
+    grouped = any(shape.class_name() == "Instance" for shape in shapes)
+    return _nodes(scene, mi.Shape) if grouped else shapes
+
+
+def _boundaries(scene):
+    """The shapes that may be boundaries of media."""
+    return [shape for shape in _shapes(scene) if _media_of(shape)]
 
 
 def _media_of(shape):

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from .layers import LAYERS
 from .lights import Lights, LightSample, lobe_angle
-from .media import Media
+from .media import Media, is_passable
 from .quotient import multiply_cells
 from .shapes import ROUNDING, ROUNDINGS, Shapes, name_of
 from .tracer import Cone, Tracer
@@ -33,7 +33,10 @@ PENUMBRA = 3
 
 
 class View:
-    """A scene seen through one integrator's parameters: what a pass needs besides its samples."""
+    """A scene seen through one integrator's parameters: what a pass needs besides its samples.
+
+    ``passable``: whether light goes straight through any of its surfaces.
+    """
 
     def __init__(
         self,
@@ -55,6 +58,7 @@ class View:
             to_world = sensor.world_transform().matrix
             focus = mi.ScalarPoint3f([to_world[i, 3][0] for i in range(3)])
         self.media = Media(scene, sensor, self.space, self.shapes)
+        self.passable = is_passable(scene)
         reach = self.media.reach(integrator.max_distance)
         # A set distance is that of the sky, however dense the air before it
         ends = self.space.quotient and math.isinf(integrator.max_distance)

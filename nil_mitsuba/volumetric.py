@@ -349,7 +349,7 @@ class VolumetricPaths:
         # Light from infinity comes from as far as rays reach
         length = dr.minimum(light.reach, tracer.max_distance)
         u = sampler.next_1d(active)
-        if media.passable:
+        if view.passable:
             return self._through_surfaces(
                 vertex, p, start, d, length, cone, medium, media.seed(u), active
             )

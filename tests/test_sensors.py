@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from benchmarks.studio import film, place
+from benchmarks.studio import film, gradient, place
 from nil_mitsuba import geometry
 from ztest import Estimate, assert_same_expectation
 
@@ -320,3 +320,29 @@ def test_passes_make_the_image_of_all_their_samples(rgb, monkeypatch):
     image = mi.render(scene, integrator=integrator, spp=64)
     assert dr.max(dr.abs(image.array - exact.array))[0] <= 5 * 1.5 * (1 / 64) ** 0.5
     assert dr.mean(dr.abs(image.array - exact.array))[0] <= 0.03
+
+
+@pytest.mark.parametrize("hole", ["null", "mask", "instance"])
+def test_a_surface_without_substance_leaves_the_sky_as_it_is(rgb, hole):
+    """The sky is seen in the direction that the camera's ray has, wherever it went through."""
+    bsdf = {"type": "null"}
+    if hole == "mask":
+        bsdf = {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
+    ball = {"type": "sphere", "center": [2.7, 0.8, -0.5], "bsdf": bsdf}
+    shapes = {"ball": ball}
+    if hole == "instance":
+        group = {"type": "shapegroup", "id": "group", "ball": ball}
+        shapes = {"group": group, "one": {"type": "instance", "of": {"type": "ref", "id": "group"}}}
+    scene = {
+        "type": "scene",
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(gradient(16, 8))},
+        "sensor": sensor("perspective", (0, 0, 0), fov=70),
+        "dot": {"type": "sphere", "center": [0, 0, 9], "radius": 1e-3},
+    }
+    # Roulette ends no path that has passed a ball twice
+    integrator = mi.load_dict(PLAIN | {"twist": 2.0, "max_depth": 12, "rr_depth": 99})
+    without, through = (
+        mi.render(mi.load_dict(scene | more), integrator=integrator, spp=1, seed=1)
+        for more in ({}, shapes)
+    )
+    assert dr.allclose(through, without, atol=1e-6)
