@@ -297,7 +297,7 @@ def heterogeneous():
 
 def fog(medium):
     def workload(quick):
-        width, spp = (16, 4) if quick else (64, 256)
+        width, spp = (4, 1) if quick else (64, 256)
         found = {"volpath": {"type": "volpath"}}
         found |= {f"twist {twist}": PLAIN | {"twist": twist} for twist in (0.0, 1.0)}
         return {
@@ -310,7 +310,7 @@ def fog(medium):
 
 def lattice_in_fog(quick):
     """`lattice` with the mean free path of two cells and the albedo ½, as far as rays go."""
-    size = {"resx": 32, "resy": 18} if quick else {"resx": 320, "resy": 180}
+    size = {"resx": 16, "resy": 9} if quick else {"resx": 320, "resy": 180}
     fog = {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.5}
     return {
         name: Render(
