@@ -1,23 +1,24 @@
 """How much emitter sampling along geodesics is worth, and how well it chooses among images.
 
 Prints, for a small light in the quotient, clear and in fog, and for the bent Cornell box, the
-relative MSE of BSDF and phase sampling alone over that with emitter sampling at equal time; and,
-for several receivers and lights, the variance of the choice of one image of the light against that
-of an oracle, which knows the light of every image within the distance and chooses in proportion to
-it.
+relative MSE of BSDF and phase sampling alone over that with emitter sampling at equal time; what
+roulette on shadow rays in fog is worth; and, for several receivers and lights, the variance of the
+choice of one image of the light against that of an oracle, which knows the light of every image
+within the distance and chooses in proportion to it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 
-from nil_mitsuba import geometry  # noqa: E402 - after the variant is set
+from nil_mitsuba import geometry, volumetric  # noqa: E402 - after the variant is set
 from nil_mitsuba.lights import Images  # noqa: E402
 from nil_mitsuba.quotient import Space  # noqa: E402
 
@@ -122,6 +123,28 @@ def compare_at_equal_time(name, make, goal, quick):
     )
 
 
+def roulette_in_fog(quick):
+    """The error times the time, by what part of its light a shadow ray must be able to bring to be
+    traced every time; over that of tracing all."""
+    scene, parameters = small_light_in_fog()
+    integrator = mi.load_dict({"type": "nil"} | parameters)
+    spp = 2 if quick else 64
+    reference = mi.render(scene, integrator=integrator, spp=24 * spp, seed=99).array
+    costs = {}
+    for dim in (1e-9, volumetric.DIM):
+        with mock.patch.object(volumetric, "DIM", dim):
+            timed(scene, integrator, spp, 0)  # compiles
+            runs = [timed(scene, integrator, spp, seed) for seed in (1, 2, 3, 4)]
+        error = sum(relative_mse(image, reference) for image, _ in runs)
+        costs[dim] = error * min(seconds for _, seconds in runs)
+    every, some = costs.values()
+    print(
+        f"roulette on what a shadow ray in fog may bring, below {volumetric.DIM:g}: "
+        f"{some / every:.2f} of the error times the time without it",
+        flush=True,
+    )
+
+
 # ------------------------------------------------------------------ which image
 
 
@@ -181,6 +204,7 @@ def main():
     print("relative MSE")
     compare_at_equal_time("small light in the quotient", small_light, 10, quick)
     compare_at_equal_time("the same in fog", small_light_in_fog, 10, quick)
+    roulette_in_fog(quick)
     compare_at_equal_time("bent Cornell box", bent_cornell_box, 3, quick)
 
     print(

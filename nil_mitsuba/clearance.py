@@ -15,7 +15,7 @@ import mitsuba as mi
 from . import geometry
 from .geometry import larger, smaller
 from .quotient import Space, opaque
-from .shapes import FAR, Shapes
+from .shapes import FAR, Shapes, corners_of
 
 # Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere
 QUOTIENT_VOXELS = 56
@@ -454,7 +454,7 @@ class _Pieces:
     def __init__(self, shapes):
         meshes = [shape for shape in shapes.shapes if shape.is_mesh()]
         meshes = sorted(meshes, key=lambda mesh: -mesh.face_count())[:MOST_MESHES]
-        self.triangles = [_triangles(mesh) for mesh in meshes]
+        self.triangles = [corners_of(mesh) for mesh in meshes]
         self.rods = []
         rods: list[tuple[float, ...]] = []
         squares: list[tuple[float, ...]] = []
@@ -492,16 +492,6 @@ def _columns(shape):
     """The columns of a shape's transform, in Python floats."""
     matrix = mi.traverse(shape)["to_world"].matrix
     return [[matrix[i, j][0] for i in range(3)] for j in range(4)]
-
-
-def _triangles(mesh):
-    """Corners (scene units) of a mesh's triangles."""
-    positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
-    triangle = dr.arange(mi.UInt32, mesh.face_count())
-    return [
-        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
-        for i in range(3)
-    ]
 
 
 def _segments(curve, kind):

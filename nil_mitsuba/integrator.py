@@ -15,7 +15,7 @@ from .interaction import offset, surface_interaction
 from .layers import channel_names
 from .lights import LightSample
 from .passes import Passes
-from .quotient import Space, multiply_cells
+from .quotient import Space, multiply_cells, seen_from
 from .tracer import Cone
 from .view import View, warn_of_what_is_ignored
 from .volumetric import VolumetricPaths
@@ -300,9 +300,7 @@ class NilIntegrator(ADIntegrator):
         start = offset(si.p, si.n, light.direction, margin, space)
         if space.quotient:
             start, home = geometry.wrap(start, space.twist)
-            p = geometry.multiply(
-                mi.Point3f(geometry.inverse(home, space.integer_twist)), p, space.twist
-            )
+            p = seen_from(home, p, space)
         reach = light.reach
         if view.lights.has_infinite:
             reach = dr.minimum(reach, tracer.reach(start, light.direction))

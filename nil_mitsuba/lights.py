@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import geometry
-from .quotient import Space, opaque
+from .quotient import Space, opaque, table
 from .shapes import margin_on
 from .tracer import Hit
 
@@ -249,7 +249,7 @@ class Lights:
                 # Mitsuba tells the position of every kind in a direction sample.
                 sample, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
                 at[i] = [sample.p[axis][0] for axis in range(3)]
-        return opaque(mi.Point3f(*(mi.Float([p[axis] for p in at]) for axis in range(3))))
+        return table(at)
 
     def _number_area_lights(self, emitters, names):
         """Tables of the densities of points on area lights, by the number of the emitter's pointer.
@@ -298,12 +298,7 @@ class Lights:
                 centres[i], sides[i] = list(centre), side[0]
         if not any(sides):
             return None
-        return opaque(
-            (
-                mi.Point3f(*(mi.Float([c[axis] for c in centres]) for axis in range(3))),
-                mi.Float(sides),
-            )
-        )
+        return table(centres), opaque(mi.Float(sides))
 
     # ---------------------------------------------------------------- sampling
 

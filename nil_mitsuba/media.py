@@ -17,14 +17,14 @@ import mitsuba as mi
 
 from . import geometry
 from .box import Box, Passage
-from .quotient import Space, opaque
-from .shapes import ROUNDING, Shapes, name_of
+from .quotient import Space, opaque, table
+from .shapes import ROUNDING, Shapes, corners_of, name_of
 
 # How a medium's collisions are found: by its constant extinction; one by one, and none where the
 # geodesic has left the box of the shapes that it is in; or one by one where it is in the box of
 # the medium's own volumes.
 CONSTANT, WITHIN, OPEN = range(3)
-# So near (cells) boundaries are on a face: much more than rays start off surfaces.
+# So near (cells) a boundary is on a face: much more than rays start off surfaces.
 NEAR = 1e-4
 # Light that has this optical depth before it is not looked for: 2e-9 of it arrive.
 OPAQUE_DEPTH = 20.0
@@ -46,7 +46,7 @@ class Media:
         self.scene = scene
         self.filling = _around(sensor) if sensor is not None else None
         boxes = _boxes(scene, shapes)
-        self.media = list(boxes)  # those with boundaries
+        self.bounded = list(boxes)
         if self.filling is not None:
             boxes[self.filling] = None
         self.exist = bool(boxes)
@@ -87,10 +87,7 @@ class Media:
             if box is not None:
                 lower[pointer], upper[pointer] = self._in_cells(box)
         self.kinds = opaque(mi.UInt32(kinds))
-        self.lower, self.upper = (
-            opaque(mi.Point3f(*(mi.Float([c[axis] for c in corners]) for axis in range(3))))
-            for corners in (lower, upper)
-        )
+        self.lower, self.upper = table(lower), table(upper)
         present = {kinds[pointer] for pointer in pointers}
         self.integrates = CONSTANT in present
         self.tracks = bool(present - {CONSTANT})
@@ -134,7 +131,7 @@ class Media:
                     f'"max_distance" is infinite, and {_called(self.filling)}, which fills the '
                     f"cell, is so thin that light comes from beyond {MOST_CELLS:g} cells: {cells}."
                 )
-        if least == 0 or (self.media and not math.isinf(max_distance)):
+        if least == 0 or (self.bounded and not math.isinf(max_distance)):
             return max_distance
         return min(max_distance, OPAQUE_DEPTH / (least * self.space.size_number))
 
@@ -143,7 +140,7 @@ class Media:
         sentences = []
         for emitter in self.scene.emitters():
             medium = emitter.get_medium()
-            if medium is not None and medium is not self.filling and medium not in self.media:
+            if medium is not None and medium is not self.filling and medium not in self.bounded:
                 name = f'"{emitter.id()}"' if emitter.id() else emitter.class_name()
                 sentences.append(
                     f"the emitter {name} names a medium that fills nothing: name it in the sensor, "
@@ -161,7 +158,7 @@ class Media:
         )
         filling = self.filling
         # Others end with the box of their grids
-        endless = filling is not None and filling not in self.media and filling.is_homogeneous()
+        endless = filling is not None and filling not in self.bounded and filling.is_homogeneous()
         if lit and endless and math.isinf(max_distance):
             sentences.append(
                 f"{_called(filling)} is all around the sensor without end, so that no light "
@@ -509,12 +506,7 @@ def _is_open(shape):
     """Whether a shape certainly has an edge."""
     if not shape.is_mesh():
         return bool(shape.shape_type() & (mi.ShapeType.Rectangle | mi.ShapeType.Disk))
-    positions, faces = shape.vertex_positions_buffer(), shape.faces_buffer()
-    triangle = dr.arange(mi.UInt32, shape.face_count())
-    a, b, c = (
-        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
-        for i in range(3)
-    )
+    a, b, c = corners_of(shape)
     # The area vectors of a closed surface add up to zero
     area = dr.cross(b - a, c - a)
     total = [dr.sum(component)[0] for component in area]

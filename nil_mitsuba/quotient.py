@@ -13,9 +13,15 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from . import geometry
 from .geometry import larger, smaller
 
 Vector = TypeVar("Vector", bound=Any)  # any of Mitsuba's types with three components
+
+
+def table(points) -> mi.Point3f:
+    """Points (three numbers each) that kernels gather from memory."""
+    return opaque(mi.Point3f(*(mi.Float([p[axis] for p in points]) for axis in range(3))))
 
 
 def opaque(value):
@@ -175,6 +181,12 @@ def into_cell(
     ]
     g = multiply_cells(cell, mi.Vector3i(fx, fy, fz), space)
     return mi.Point3f(p.x - step_x, y, z - step_z), moved, g
+
+
+def seen_from(cell: mi.Vector3i, p: mi.Point3f, space: Space) -> mi.Point3f:
+    """A point ``p`` (cells) as it is seen from the cell that a deck element leads to."""
+    inverse = mi.Point3f(geometry.inverse(cell, space.integer_twist))
+    return mi.Point3f(geometry.multiply(inverse, p, space.twist))
 
 
 def multiply_cells(g: mi.Vector3i, h: mi.Vector3i, space: Space) -> mi.Vector3i:

@@ -247,17 +247,22 @@ def _shrinkage(instance):
     return sum(inverse[i, j][0] ** 2 for i in range(3) for j in range(3))
 
 
+def corners_of(mesh: mi.Mesh) -> list[mi.Point3f]:
+    """The first, second and third corners (scene units) of all triangles of a mesh."""
+    positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
+    triangle = dr.arange(mi.UInt32, mesh.face_count())
+    return [
+        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
+        for i in range(3)
+    ]
+
+
 class _Triangles:
     """The box of a mesh's triangles and the largest coordinate of each, still to be waited for."""
 
     def __init__(self, mesh):
-        positions, faces = mesh.vertex_positions_buffer(), mesh.faces_buffer()
         self.count = mesh.face_count()
-        triangle = dr.arange(mi.UInt32, self.count)
-        a, b, c = (
-            dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * triangle + i))
-            for i in range(3)
-        )
+        a, b, c = corners_of(mesh)
         finite = dr.all((dr.abs(a) < FAR) & (dr.abs(b) < FAR) & (dr.abs(c) < FAR))
         low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         self.largest = dr.max(dr.maximum(dr.abs(low), dr.abs(high)))

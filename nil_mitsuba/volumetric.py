@@ -16,19 +16,18 @@ from mitsuba.python.ad.integrators.common import mis_weight
 from . import geometry
 from .interaction import offset, surface_interaction
 from .lights import LightSample
-from .quotient import multiply_cells
+from .media import NEAR
+from .quotient import multiply_cells, seen_from
 from .tracer import Cone, line_ray, random_of
 from .view import to_rgb
 
 if TYPE_CHECKING:
     from .integrator import NilIntegrator, View
 
-# A shadow ray that can bring no more than this part of its light is traced so much more seldom: at
-# equal time the error of `lattice` in fog is a third of what it is otherwise, and of a small lamp's
-# light two thirds. With 0.1 it is a sixth more.
+# A shadow ray that can bring no more than this part of its light is traced so much more seldom,
+# which saves a third of the time for the same error of a small lamp in fog
+# (benchmarks/emitter_sampling.py), and more where the sky is the light.
 DIM = 0.5
-# So far (cells) a surface on a face may be behind where the ray starts that went through it.
-BEHIND = 1e-4
 
 
 class VolumetricPaths:
@@ -115,12 +114,7 @@ class VolumetricPaths:
             end = hit.end
             if dr.hint(not space.quotient, mode="scalar"):
                 end = self._at(p, v, dr.select(collided, free, 0))
-            arrival = hit.arrival
-            turn = space.twist * space.to_cell_axes(v).z
-            if dr.hint(not space.flat, mode="scalar"):
-                arrival = space.to_cell_axes(v)
-                arrival = space.to_scene_axes(geometry.turned(arrival, turn * free))
-                arrival = dr.select(collided, arrival, hit.arrival)
+            arrival = dr.select(collided, self._turned(v, free), hit.arrival)
             mei = media.interaction(medium, end, arrival, ray)
 
             f, r = media.weights(left, p, length, mei, collided, channel, seed, in_medium)
@@ -131,11 +125,7 @@ class VolumetricPaths:
 
             # --------------------- Direct emission ---------------------
 
-            v_start = v
-            if dr.hint(not space.flat, mode="scalar"):
-                v_start = space.to_cell_axes(v)
-                v_start = space.to_scene_axes(geometry.turned(v_start, -turn * travelled))
-                v_start = dr.select(depth == 0, first, v_start)
+            v_start = dr.select(depth == 0, first, self._turned(v, -travelled))
             si = surface_interaction(hit, v_start, space, ray.wavelengths)
             on_surface = active & si.is_valid()
             emitter = si.emitter(scene)
@@ -290,8 +280,7 @@ class VolumetricPaths:
                 through |= si.shape.emitter() != None  # noqa: E711
             seen = view.see(seen, hit, si, cell, travelled, active & ~through)
             active &= through
-            margin = view.margin(hit, si)
-            p = offset(si.p, si.n, hit.arrival, margin, space)
+            p = offset(si.p, si.n, hit.arrival, view.margin(hit, si), space)
             medium = self._beyond(medium, si, hit.arrival, active)
             cone.width = dr.fma(cone.spread, length, cone.width)
             v = hit.arrival
@@ -310,8 +299,8 @@ class VolumetricPaths:
             if passed:
                 view, space = self.view, self.view.space
                 ahead = _first_axis(home)
-                start = space.to_scene(p - BEHIND * ahead)
-                length = 2 * BEHIND * space.size
+                start = space.to_scene(p - NEAR * ahead)
+                length = 2 * NEAR * space.size
                 ray = line_ray(start, space.to_scene_axes(ahead), time, length)
                 found = view.scene.ray_intersect_preliminary(ray, coherent=False, active=passed)
                 si = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
@@ -334,18 +323,26 @@ class VolumetricPaths:
         space = self.view.space
         return mi.Point3f(geometry.flow(p, space.to_cell_axes(v), length, space.twist)[0])
 
+    def _turned(self, v, length):
+        """The frame direction ``v`` of a geodesic at a ``length`` (cells) from there."""
+        space = self.view.space
+        if space.flat:
+            return v
+        d = space.to_cell_axes(v)
+        return space.to_scene_axes(geometry.turned(d, space.twist * d.z * length))
+
     def _transmitted(self, sampler, vertex, start, light, cone, medium, active):
         """What part of a light that was drawn at a ``vertex`` arrives at it.
 
         The geodesic begins at ``start`` (cells), beside the vertex, in the ``medium``.
         """
-        view, media, space = self.view, self.media, self.view.space
+        view, media = self.view, self.media
         space, tracer = view.space, view.tracer
         p, d = space.to_cells(vertex.p), light.direction
         if space.quotient:
             start, home = geometry.wrap(start, space.twist)
             start = mi.Point3f(start)
-            p = self._from_cell(p, home)
+            p = seen_from(home, p, space)
         # Light from infinity comes from as far as rays reach
         length = dr.minimum(light.reach, tracer.max_distance)
         u = sampler.next_1d(active)
@@ -397,23 +394,16 @@ class VolumetricPaths:
 
             # To the side to which the chord went on, wherever the geodesic beside it goes
             side = -si.to_world(si.wi)
-            margin = view.margin(hit, si)
-            start = offset(si.p, si.n, side, margin, space)
+            start = offset(si.p, si.n, side, view.margin(hit, si), space)
             medium = self._beyond(medium, si, side, active)
             p, v, left = hit.end, hit.arrival, left - length
             cone.width = dr.fma(cone.spread, length, cone.width)
             if dr.hint(space.quotient, mode="scalar"):
                 start, home = geometry.wrap(start, space.twist)
                 start = mi.Point3f(start)
-                p = self._from_cell(p, home)
+                p = seen_from(home, p, space)
                 medium = self._behind_face(medium, start, home, active, vertex.time)
         return passed
-
-    def _from_cell(self, p, home):
-        """A point (cells) as it is seen from the cell ``home``."""
-        space = self.view.space
-        inverse = mi.Point3f(geometry.inverse(home, space.integer_twist))
-        return mi.Point3f(geometry.multiply(inverse, p, space.twist))
 
 
 def _first_axis(home):

@@ -303,6 +303,16 @@ def test_flat_boundaries_of_every_kind_have_the_expectation_of_volpath(rgb):
     compare(tiles(list(boundaries().values()), 4, **lamps()), spp=256, block=8, max_depth=8)
 
 
+def camera_in(medium):
+    return {
+        "type": "perspective",
+        "fov": 70,
+        "film": film(32, 32),
+        "to_world": T().look_at([1.6, -1.4, 0.6], [0, 0, 0], [0, 0, 1]),
+        "medium": medium,
+    }
+
+
 def fog_room(**lights):
     """A camera in a fog that fills a black room with things and another medium in it."""
     medium = mi.load_dict(fog(0.4, albedo=0.9, phase=hg(0.4)))
@@ -311,13 +321,7 @@ def fog_room(**lights):
     return mi.load_dict(
         {
             "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "fov": 70,
-                "film": film(32, 32),
-                "to_world": T().look_at([1.6, -1.4, 0.6], [0, 0, 0], [0, 0, 1]),
-                "medium": medium,
-            },
+            "sensor": camera_in(medium),
             "walls": {
                 "type": "cube",
                 "to_world": T().scale(2),
@@ -365,13 +369,7 @@ def surrounded():
     return mi.load_dict(
         {
             "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "fov": 70,
-                "film": film(32, 32),
-                "to_world": T().look_at([1.6, -1.4, 0.6], [0, 0, 0], [0, 0, 1]),
-                "medium": medium,
-            },
+            "sensor": camera_in(medium),
             "air": {"type": "sphere", "radius": 2.5} | outside,
             "sky": environment(),
             "floor": {"type": "disk", "to_world": T().translate([0, 0, -1]).scale(1.5)},
