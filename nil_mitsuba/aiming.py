@@ -141,12 +141,27 @@ def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:
 
     A mirrored camera stays so, and an orthographic one, whose scale is its film's size.
     """
-    left, above, forward, _ = columns_of(sensor.world_transform())
+    *_, view, origin = columns_of(mi.Transform4f(aim.to_world))
+    lines = placing(view, up, origin, scale_of(sensor.world_transform()))
+    text = "\n    ".join(('<transform name="to_world">', *lines)) + "\n</transform>"
+    if isinstance(sensor, mi.ProjectiveCamera):  # other sensors refuse a focus
+        text += f'\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
+    return text
+
+
+def scale_of(to_world: mi.Transform4f) -> list[float]:
+    """By what a camera's axes are scaled; the first is negative if it is mirrored."""
+    left, above, forward, _ = columns_of(to_world)
     scale = [math.hypot(*column) for column in (left, above, forward)]
     if _dot(_cross(left, above), forward) < 0:
         scale[0] = -scale[0]
-    matrix = aim.to_world.matrix
-    view, origin = ([matrix[i, j] for i in range(3)] for j in (2, 3))
+    return scale
+
+
+def placing(
+    view: Sequence[float], up: Sequence[float], origin: Sequence[float], scale: Sequence[float]
+) -> list[str]:
+    """What stands in a scene file's <transform> of a camera, line by line."""
     # A look from the origin, and then a move: far away, a difference of points would lose digits
     lines = [
         f'<lookat origin="0, 0, 0" target="{_numbers(view)}" up="{_numbers(up)}"/>',
@@ -154,10 +169,7 @@ def as_xml(aim: Aim, up: Sequence[float], sensor: mi.Sensor) -> str:
     ]
     if any(abs(s - 1) > LEVEL for s in scale):
         lines.insert(0, f'<scale value="{_numbers(scale)}"/>')
-    text = "\n    ".join(('<transform name="to_world">', *lines)) + "\n</transform>"
-    if isinstance(sensor, mi.ProjectiveCamera):  # other sensors refuse a focus
-        text += f'\n<float name="focus_distance" value="{number_text(aim.focus_distance)}"/>'
-    return text
+    return lines
 
 
 def _nil_of(holder):

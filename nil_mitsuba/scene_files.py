@@ -79,7 +79,7 @@ class SceneFiles:
             if nodes[i].type != mi.ObjectType.Film:
                 continue
             props = nodes[i].props
-            filters = [key for key, index in self._children(props) if nodes[index].type == kind]
+            filters = [key for key, index in children(props) if nodes[index].type == kind]
             names = [nodes[props[key].index()].props.plugin_name() for key in filters]
             if names == ["box"]:
                 continue
@@ -128,9 +128,7 @@ class SceneFiles:
         """Take the integrator out of the scene; a reference to its node among `alone`'s."""
         nodes, root = self.alone.nodes, self.rest.root.props
         own = [
-            key
-            for key, index in self._children(root)
-            if nodes[index].type == mi.ObjectType.Integrator
+            key for key, index in children(root) if nodes[index].type == mi.ObjectType.Integrator
         ]
         if len(own) > 1:
             raise ValueError(f'"{path}": only one integrator can be specified per scene.')
@@ -151,7 +149,7 @@ class SceneFiles:
         node = self.alone.nodes[index]
         if node.props.plugin_name() == "nil":
             return node
-        for _, child in self._children(node.props):
+        for _, child in children(node.props):
             found = self._find_nil(child)
             if found is not None:
                 return found
@@ -167,14 +165,15 @@ class SceneFiles:
         node.props = props
         return node
 
-    def _children(self, props) -> list[tuple[str, int]]:
-        """Names and node numbers of the objects below a node."""
-        values = ((key, props[key]) for key in props.keys())
-        return [
-            (key, value.index())
-            for key, value in values
-            if isinstance(value, mi.Properties.ResolvedReference)
-        ]
+
+def children(props) -> list[tuple[str, int]]:
+    """Names and node numbers of the objects below a node."""
+    values = ((key, props[key]) for key in props.keys())
+    return [
+        (key, value.index())
+        for key, value in values
+        if isinstance(value, mi.Properties.ResolvedReference)
+    ]
 
 
 def parse_value(text: str):
