@@ -162,7 +162,8 @@ class NilIntegrator(ADIntegrator):
         lights = view.lights
         sampling = self.emitter_sampling and lights.exist
         bsdf_ctx = mi.BSDFContext()
-        depth_limit = 0xFFFFFFFF if self.max_depth == -1 else self.max_depth
+        # Opaque: pictures of other depths need no other kernel
+        depth_limit = dr.opaque(mi.UInt32, 0xFFFFFFFF if self.max_depth == -1 else self.max_depth)
 
         # --------------------- Configure loop state ----------------------
 
@@ -174,8 +175,8 @@ class NilIntegrator(ADIntegrator):
         β = mi.Spectrum(1)                     # Path throughput weight
         η = mi.Float(1)                        # Index of refraction
         active = mi.Bool(active) & (depth_limit > 0)
-        valid = mi.Bool(not self.hide_emitters and depth_limit > 0
-                        and scene.environment() is not None)
+        valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        valid &= depth_limit > 0
 
         # Variables caching information from the previous bounce
         vertex_prev     = mi.Point3f(p)        # Its position (cells)

@@ -84,7 +84,7 @@ def levels(
     if colours < channels:
         alpha = dr.select(alpha > 0, dr.minimum(alpha, 1), 0)
         colour = dr.select(alpha > 0, colour / alpha, 0)
-    colour = colour * 2.0**exposure
+    colour = colour * dr.opaque(mi.Float32, 2.0**exposure)  # one kernel for all exposures
     colour = dr.select(colour > 0, colour, 0)
     if filmic:
         colour = filmic_curve(colour)

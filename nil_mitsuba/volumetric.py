@@ -55,7 +55,9 @@ class VolumetricPaths:
         integrator, view, media = self.integrator, self.view, self.media
         scene, space, tracer, lights = view.scene, view.space, view.tracer, view.lights
         bsdf_ctx, phase_ctx = mi.BSDFContext(), mi.PhaseFunctionContext()
-        depth_limit = 0xFFFFFFFF if integrator.max_depth == -1 else integrator.max_depth
+        depth_limit = dr.opaque(
+            mi.UInt32, 0xFFFFFFFF if integrator.max_depth == -1 else integrator.max_depth
+        )
 
         # --------------------- Configure loop state ----------------------
 
@@ -68,8 +70,8 @@ class VolumetricPaths:
         β = mi.Spectrum(1)                     # Path throughput weight
         η = mi.Float(1)                        # Index of refraction
         active = mi.Bool(active) & (depth_limit > 0)
-        valid = mi.Bool(not integrator.hide_emitters and depth_limit > 0
-                        and scene.environment() is not None)
+        valid = mi.Bool(not integrator.hide_emitters and scene.environment() is not None)
+        valid &= depth_limit > 0
 
         # Throughput is over the density of the channel that draws lengths; the others', over that
         channel = mi.UInt32(0)
