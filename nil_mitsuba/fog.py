@@ -28,14 +28,10 @@ class Fog:
         """By the names of the command's options, as a still's settings and its header tell them."""
         return {"fog": self.density, "fog_albedo": self.albedo}
 
-    def fill(self, scene: mi.Scene, nil: mi.Integrator) -> str:
-        """Let all sensors of a loaded scene be in the fog; what is to be said of it.
-
-        ``nil``: the integrator whose cells the fog is measured in.
-        """
-        # What the lines that are printed say, so that they give the same picture
-        sigma_t, albedo = number_text(self.density / nil.cell_size), number_text(self.albedo)
-        medium = mi.load_dict(
+    def medium(self, nil: mi.Integrator) -> mi.Medium:
+        """The fog as a medium; ``nil``: the integrator whose cells it is measured in."""
+        sigma_t, albedo = self._numbers(nil)
+        return mi.load_dict(
             {
                 "type": "homogeneous",
                 "id": "fog",  # as warnings call it
@@ -43,6 +39,24 @@ class Fog:
                 "albedo": float(albedo),
             }
         )
+
+    def thicken(self, medium: mi.Medium, nil: mi.Integrator) -> None:
+        """Make a `medium` of another fog's as dense as this one."""
+        parameters = mi.traverse(medium)
+        parameters["sigma_t.value.value"] = float(self._numbers(nil)[0])
+        parameters.update()
+
+    def _numbers(self, nil):
+        # What the lines that are printed say, so that they give the same picture
+        return number_text(self.density / nil.cell_size), number_text(self.albedo)
+
+    def fill(self, scene: mi.Scene, nil: mi.Integrator) -> str:
+        """Let all sensors of a loaded scene be in the fog; what is to be said of it.
+
+        ``nil`` as of `medium`.
+        """
+        sigma_t, albedo = self._numbers(nil)
+        medium = self.medium(nil)
         for sensor in scene.sensors():
             # A wrapper asks for the first one's, whichever renders; a batch's own is that of all
             sensor.set_medium(medium)

@@ -26,6 +26,7 @@ VARIANT_MODULES = (
     "nil_mitsuba.volumetric",
     "nil_mitsuba.passes",
     "nil_mitsuba.integrator",
+    "nil_mitsuba.preview",
 )
 
 # The sensors are for any integrator, and so for the variants, too, that cannot run "nil".
