@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+import webbrowser
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -463,6 +464,66 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit, fog
     origin = origin or aiming.columns_of(before)[3]
     found = aiming.look_at(opened.nil, origin, target, up, image)
     click.echo(aiming.as_xml(found, up, camera))
+
+
+@cli.command(cls=FittingCommand)
+@click.argument("scene", metavar="SCENE.xml")
+@scene_options
+@click.option(
+    "--port",
+    type=click.IntRange(0, 2**16 - 1),
+    default=0,
+    help="Of the page.  [default: one that is free]",
+)
+@click.option("--browser/--no-browser", default=True, help="Open the page.  [default: browser]")
+@click.option("-t", "--threads", type=click.IntRange(1), help="Threads that render.")
+@click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
+def view(
+    scene, port, browser, threads, verbose, mode, define, sensor, properties, fit, fog, fog_albedo
+):
+    """Walk through a scene in the browser, and keep the cameras that are worth it.
+
+    The page is for this computer only. It ends with its window, or with Ctrl-C.
+    """
+    from . import server  # says what it needs before anything is loaded
+
+    _scene_path(scene)
+    _set_variant(mode, verbose)
+    dr.set_thread_count(threads or dr.thread_count())
+    job = jobs.Job(
+        scene, mode, dict(define), dict(properties), sensor, fit=fit, fog=_fog(fog, fog_albedo)
+    )
+    with server.serve(port) as link, stills.interruption() as signals:
+        click.echo(link.url)
+        if browser:
+            webbrowser.open(link.url)
+        try:
+            finder = _viewfinder(job, link)
+        except Exception as error:
+            sentence = tidy(str(cause_of(error)))
+            link.send({"is": "end", "text": sentence})
+            if browser:
+                _note(f"nil-mitsuba: {sentence}")
+            raise
+        finder.run(ended=lambda: bool(signals))
+        link.send({"is": "end", "text": "The command has ended."})
+
+
+def _viewfinder(job: jobs.Job, link):
+    """What ``view`` shows."""
+    from .viewfinder import Viewfinder
+
+    notes: list[str] = []
+
+    def note(sentence):
+        _note(sentence)
+        notes.append(sentence)
+
+    opened = jobs.open_scene(job, note, aiming=True)
+    options = [] if job.variant == "llvm_ad_rgb" else ["-m", job.variant]
+    options += [word for item in job.defines.items() for word in ("-D", "=".join(item))]
+    options += ["-s", str(job.sensor)] if job.sensor else []
+    return Viewfinder(opened, options, notes, link)
 
 
 @cli.command()

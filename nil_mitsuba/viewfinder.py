@@ -1,0 +1,721 @@
+"""The viewfinder: what who looks at a scene asks for, and the pictures that he sees meanwhile.
+
+It knows neither browser nor network: messages come from a `Link` and events go to it, as they are
+described there. Everything runs in one thread.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import os
+import shlex
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from . import jobs, keys
+from .errors import cause_of
+from .fog import ALBEDO, Fog
+from .pose import Chart, Pose
+from .scene_copy import SceneText
+from .scene_files import number_text
+
+if TYPE_CHECKING:
+    from .preview import Canvas, Preview
+
+# While something moves, a picture should take about so long: twice the five a second that a walk
+# needs at least. Sizes grow and shrink by this factor where it takes less or more.
+FRAME_SECONDS, STEP = 0.1, math.sqrt(2)
+SMALLEST = 160  # pixels wide; a coarser picture shows nothing
+
+# Paths are so long while something moves. Longer ones change little but inside glass.
+MOVING_DEPTH = 4
+
+DEEPEST = 64  # the end of the slider, which stands for no limit
+
+# Nothing that is asked for waits longer than for one piece of a picture, of so many samples.
+PIECE_SECONDS = 0.1
+FIRST_PIECE, LEAST_PIECE = 2**15, 2**12
+
+# A picture that refines is shown whenever it has twice as many samples, but at least so often.
+SHOW_SECONDS = 5.0
+
+# However long a picture takes, the next one is no farther away than so many seconds of walking.
+LONGEST_STEP = 0.25
+TURN = math.radians(60)  # a second, by the arrows
+SPEED = 0.4  # cells a second
+NOTCH = 1.25  # of the wheel, to the speed
+
+WAIT_SECONDS = 0.2  # for messages, if there is nothing to do; signals are looked at between
+
+# A page that is loaded again is back within so many seconds; then it was closed.
+LEAVING_SECONDS = 3.0
+
+
+LENS = ("x_fov", "focus_distance", "aperture_radius")
+
+
+class Link(Protocol):
+    """What a viewfinder sees of who looks through it."""
+
+    viewer: bool  # whether there is anybody
+    ready: bool  # whether a picture would be shown at once
+
+    def messages(self, wait: float) -> list[dict]:
+        """What has been asked for; waits so many seconds if there is nothing."""
+
+    def send(self, event: dict) -> None:
+        """Tell something."""
+
+    def show(self, header: dict, jpeg: bytes) -> bool:
+        """Show a picture; whether it was taken."""
+
+
+@dataclass
+class Slider:
+    """A number that who looks may change, and what is done about it."""
+
+    name: str
+    label: str
+    value: float
+    least: float
+    most: float
+    step: float
+    take: Callable[[float], None]
+    unit: str = ""
+    log: bool = False
+
+    def event(self) -> dict:
+        return {
+            "name": self.name,
+            "label": self.label,
+            "min": self.least,
+            "max": self.most,
+            "step": self.step,
+            "value": self.value,
+            "log": self.log,
+            "unit": self.unit,
+        }
+
+    def fitting(self, value: float) -> float:
+        """The value that it can have next to one."""
+        value = max(self.least, min(self.most, value))
+        return float(round(value)) if self.step == 1 else value
+
+
+class Viewfinder:
+    """A loaded scene with a camera that moves.
+
+    ``opened`` is the scene, with ids of shapes; ``options`` are those of the command that say
+    which scene it is, for the commands that are shown; ``notes`` are sentences on the scene. Raises
+    RuntimeError or ValueError if the scene cannot be walked through.
+    """
+
+    def __init__(self, opened: jobs.Opened, options: list[str], notes: list[str], link: Link):
+        self.job, self.scene, self.nil = opened.job, opened.scene, opened.nil
+        self.options, self.notes, self.link = options, notes, link
+        own = self.scene.sensors()[self.job.sensor]
+        self.sensor, self.lens = viewing_sensor(own, self.nil)
+        self.text = SceneText(self.job.path, self.job.defines)
+        self.own_lens = lens_of(own)
+        self.depth = self.nil.max_depth
+        self.chart = Chart.of(self.nil)
+        self.home = self.pose = Pose.of(own.world_transform(), self.chart)
+        self.first = {name: getattr(self.nil, name) for name in ("twist", "tolerance", "max_depth")}
+        fog = self.job.fog or Fog(0.0)
+        self.fog, self.fog_albedo = fog.density, fog.albedo
+        self.fog_medium = self.sensor.get_medium() if self.job.fog else None
+        self.guided = can_denoise()
+        self.denoises, self.filmic, self.exposure = self.guided, False, 0.0
+        self.preview: Preview
+        self.sliders = {slider.name: slider for slider in self._sliders()}
+        size = self.sensor.film().crop_size()
+        self.aspect = size[0] / size[1]
+
+        self.room = (1280, 720)  # pixels that the page has for the picture
+        self.width = 320  # of the picture while something moves
+        self.speed = SPEED
+        self.move, self.turn = (0.0, 0.0, 0.0), (0.0, 0.0)
+        self.kick = False  # whether a key was pressed since the last step
+        self.advanced = 0.0  # when that was
+        self.compiled = False
+        self.stale = True  # whether the camera or the scene differ from what is shown
+        self.canvas: Canvas | None = None  # the picture that refines
+        self.shown, self.shown_at = 0, 0.0  # its passes when it was shown last, and when
+        self.piece = FIRST_PIECE
+        self.broken = False  # whether there can be no picture until something changes
+        self.seconds = FRAME_SECONDS  # that a moving picture takes
+        self.frames = 0  # shown so far
+        self.picture: mi.TensorXf | None = None  # developed last, and what is told of it
+        self.header: dict = {}
+        self.untold = False  # whether it could not be shown
+        self.pointed: list[float] | None = None
+        self.keys: list[keys.Key] = []
+        self.key_path: Path | None = None
+        self.key_scene: Path | None = None  # a copy, where the scene's own sensor has no lens
+        self.saved: tuple[dict, Path] | None = None  # the last copy, and what it holds
+        self._prepare()
+
+    # ------------------------------------------------------------------ the loop
+
+    def run(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """Answer and show, until ``ended`` or until nobody looks any more."""
+        seen: float | None = None  # when somebody looked
+        while not ended():
+            for message in self.link.messages(0 if self._works() else WAIT_SECONDS):
+                self.answer(message)
+            now = time.perf_counter()
+            if self.link.viewer:
+                self._advance(min(now - self.advanced, LONGEST_STEP))
+                self.advanced = seen = now
+                self._work()
+            elif seen is not None and now - seen > LEAVING_SECONDS:
+                return
+
+    def _works(self) -> bool:
+        """Whether there is something to do besides waiting for messages."""
+        if not self.link.viewer or self.broken:
+            return False
+        return self.link.ready or not (self.stale or self._is_due())
+
+    def _work(self) -> None:
+        """The next picture or piece of one, if one is wanted; what goes wrong with it is said."""
+        try:
+            if self.stale:
+                if self.link.ready:
+                    self.broken = False
+                    self.glance()
+            elif self.untold and self.link.ready:
+                self.untold = False
+                self._tell_picture()
+            elif self.pointed is not None:
+                self._point()
+            elif self._works():
+                self.refine()
+        except (RuntimeError, ValueError, OSError) as error:
+            # Once: until something changes, the next picture would not go better
+            self.stale, self.canvas, self.broken = False, None, True
+            self.say(str(cause_of(error)), "error")
+
+    def say(self, text: str, kind: str = "note") -> None:
+        """One sentence for who looks."""
+        self.link.send({"is": "says", "text": text, "kind": kind})
+
+    # ---------------------------------------------------------------- what is seen
+
+    def look(self) -> None:
+        """Place the sensor where the camera is."""
+        self.preview.look(self.pose.to_world(self.chart), **self.lens)
+        self.stale = True
+
+    def glance(self) -> None:
+        """Show a picture at once, as large as there is time for."""
+        start = time.perf_counter()
+        width, height = self._size(self.width)
+        canvas = self.preview.canvas(width, height)
+        self.nil.max_depth = MOVING_DEPTH if self.depth < 0 else min(MOVING_DEPTH, self.depth)
+        try:
+            self.preview.render(canvas, width * height)
+        finally:
+            self.nil.max_depth = self.depth
+        self.stale, self.canvas = False, None
+        self._show(canvas, quick=True, moving=self.moving)
+        if self.compiled:
+            self._adapt(time.perf_counter() - start)
+        self.compiled = True
+
+    def _adapt(self, seconds: float) -> None:
+        """Choose the size of moving pictures by the time that the last one took."""
+        self.seconds += (seconds - self.seconds) / 4
+        if self.seconds > FRAME_SECONDS * STEP and self.width > SMALLEST:
+            self.width = max(SMALLEST, round(self.width / STEP))
+        elif self.seconds * STEP**2 < FRAME_SECONDS and self._size(self.width)[0] == self.width:
+            self.width = round(self.width * STEP)
+        else:
+            return
+        self.seconds = FRAME_SECONDS  # nothing is known of that size
+
+    def refine(self) -> None:
+        """Trace a piece of the picture in full size, and show that from time to time."""
+        if self.canvas is None:
+            self.canvas = self.preview.canvas(*self._size(self.room[0]))
+            self.shown, self.shown_at = 0, time.perf_counter()
+        canvas = self.canvas
+        if not self._is_due():
+            start = time.perf_counter()
+            count = min(self.piece, canvas.left)
+            self.preview.render(canvas, count)
+            if count == self.piece:
+                ratio = PIECE_SECONDS / (time.perf_counter() - start)
+                self.piece = int(max(LEAST_PIECE, count * max(0.5, min(2, ratio))))
+        if self._is_due() and self.link.ready:
+            self._show(canvas, quick=canvas.passes < 16, moving=False)
+            self.shown, self.shown_at = canvas.passes, time.perf_counter()
+
+    def _is_due(self) -> bool:
+        """Whether the picture that refines has come so far that it is to be shown."""
+        canvas = self.canvas
+        if canvas is None or canvas.begun or canvas.passes == self.shown:
+            return False
+        late = time.perf_counter() - self.shown_at > SHOW_SECONDS
+        return canvas.passes >= 2 * self.shown or late or not self.denoises
+
+    def _size(self, width: int) -> tuple[int, int]:
+        """A picture's size of about a width, that fits into the page's room."""
+        width = min(width, self.room[0], round(self.room[1] * self.aspect))
+        return max(2, width), max(1, round(width / self.aspect))
+
+    def _show(self, canvas: Canvas, quick: bool, moving: bool) -> None:
+        """Develop a canvas and show it."""
+        self.picture = self.preview.picture(canvas, self.denoises, quick)
+        self.header = {
+            "spp": canvas.passes,
+            "moving": moving,
+            "denoised": self.denoises,
+            "place": self.chart.to_scene(self.pose.place),
+            "cell": list(self.pose.cell) if self.chart.quotient else None,
+        }
+        self._tell_picture()
+
+    def _tell_picture(self) -> None:
+        """Show what was developed last, with the exposure that there is now."""
+        from .preview import as_jpeg  # of the current variant
+
+        if self.picture is None:
+            return
+        height, width, _ = self.picture.shape
+        self.frames += 1
+        header = self.header | {
+            "frame": self.frames,
+            "size": [width, height],
+            "fps": 1 / self.seconds,
+            "noise": None,
+            "speed": self.speed * self.chart.size,
+        }
+        if not self.link.show(header, as_jpeg(self.picture, self.exposure, self.filmic)):
+            self.untold = True
+
+    # ------------------------------------------------------------------ answers
+
+    def answer(self, message: dict) -> None:
+        """Do what a message asks for; what is wrong with it is said."""
+        try:
+            getattr(self, f"_do_{message['do']}")(message)
+        except (RuntimeError, ValueError, OSError) as error:
+            self.say(str(cause_of(error)), "error")
+
+    def _do_hello(self, message: dict) -> None:
+        self._do_size(message)
+        self.move, self.turn = (0.0, 0.0, 0.0), (0.0, 0.0)
+        self._tell_scene()
+        for sentence in self.notes:
+            self.say(sentence)
+        if not self.compiled:
+            self.say("Compiling the kernel of this scene.", "busy")
+
+    def _tell_scene(self) -> None:
+        self.link.send(
+            {
+                "is": "scene",
+                "title": Path(self.job.path).name,
+                "aspect": self.aspect,
+                "sliders": [slider.event() for slider in self.sliders.values()],
+            }
+        )
+
+    def _do_bye(self, _message: dict) -> None:
+        self.move, self.turn = (0.0, 0.0, 0.0), (0.0, 0.0)
+        self.canvas, self.stale, self.pointed = None, True, None
+        self.picture = None
+
+    def _do_size(self, message: dict) -> None:
+        width, height = message["size"]
+        room = max(SMALLEST, int(width)), max(1, int(height))
+        if room != self.room:
+            self.room, self.canvas = room, None
+        self.stale = True
+
+    def _do_look(self, message: dict) -> None:
+        dx, dy = message["by"]
+        # The point under the pointer follows it
+        angle = 2 * math.atan(math.tan(math.radians(self.fov) / 2) / self.aspect)
+        self.pose = self.pose.turned(dx * angle, dy * angle)
+        self.look()
+
+    def _do_go(self, message: dict) -> None:
+        move, turn = tuple(message["move"]), tuple(message["turn"])
+        if any(move) or any(turn):
+            if not self.moving:
+                self.advanced = time.perf_counter() - FRAME_SECONDS
+                self.kick = True
+        elif self.kick:  # let go before there was a step
+            self._advance(FRAME_SECONDS)
+        self.move, self.turn = move, turn
+
+    def _advance(self, seconds: float) -> None:
+        """Move and turn as the keys say that are held, for a time."""
+        if any(self.turn):
+            self.pose = self.pose.turned(*(TURN * seconds * c for c in self.turn))
+        if any(self.move):
+            length = self.speed * seconds * math.hypot(*self.move)
+            self.pose = self.pose.moved(self.move, length, self.chart)
+        if self.moving:
+            self.kick = False
+            self.look()
+
+    @property
+    def moving(self) -> bool:
+        """Whether keys are held that move or turn the camera."""
+        return any(self.move) or any(self.turn)
+
+    def _do_speed(self, message: dict) -> None:
+        self.speed = max(1e-4, min(1e3, self.speed * NOTCH ** message["by"]))
+        self.say(f"{self.speed:.2g} cells a second.")
+
+    def _do_home(self, _message: dict) -> None:
+        self.pose = self.home.within(self.chart)
+        self.look()
+
+    def _do_point(self, message: dict) -> None:
+        self.pointed = message["at"]
+        if self.pointed is None:
+            self._tell_sight(None, None)
+
+    def _point(self) -> None:
+        if self.pointed is not None:
+            at, self.pointed = self.pointed, None
+            self._tell_sight(at, self.preview.sight(*at))
+
+    def _tell_sight(self, at, sight) -> None:
+        names = ("shape", "cell", "position", "distance")
+        self.link.send(
+            {"is": "under", "at": at} | {name: getattr(sight, name, None) for name in names}
+        )
+
+    def _do_aim(self, message: dict) -> None:
+        sight = self.preview.sight(*message["at"])
+        self.pose = self.pose.looking(self.chart.to_cell_axes(sight.direction))
+        if sight.distance is not None and "focus" in self.sliders:
+            self._set(self.sliders["focus"], sight.distance)
+            self.link.send({"is": "value", "name": "focus", "value": self.sliders["focus"].value})
+        self.look()
+        self._tell_sight([0.5, 0.5], sight)
+
+    def _do_set(self, message: dict) -> None:
+        slider = self.sliders.get(message["name"])
+        if slider is None:
+            raise ValueError(f'there is no slider "{message["name"]}" here.')
+        self._set(slider, message["value"])
+        if slider.value != message["value"]:
+            self.link.send({"is": "value", "name": slider.name, "value": slider.value})
+
+    def _set(self, slider: Slider, value: float) -> None:
+        slider.value = slider.fitting(value)
+        slider.take(slider.value)
+
+    # -------------------------------------------------------------------- sliders
+
+    def _sliders(self) -> list[Slider]:
+        nil, size = self.nil, self.nil.cell_size
+        most = max(3.0, math.ceil(abs(nil.twist)))
+        step = 1 if nil.quotient else 0.01
+        sliders = [
+            Slider("twist", "Twist", nil.twist, -most, most, step, self._twist),
+            Slider("exposure", "Exposure", 0.0, -8, 8, 0.1, self._exposure, "stops"),
+            Slider("filmic", "Filmic", 0, 0, 1, 1, self._filmic),
+        ]
+        if "x_fov" in self.lens:
+            sliders.append(
+                Slider("fov", "Field of view", self.lens["x_fov"], 5, 150, 0.5, self._fov, "°")
+            )
+        if "focus_distance" in self.lens:
+            focus = self.lens["focus_distance"]
+            least, far = min(0.05 * size, focus), max(50 * size, focus)
+            sliders += [
+                Slider("focus", "Focus", focus, least, far, 0.01, self._focus, log=True),
+                Slider(
+                    "aperture",
+                    "Aperture",
+                    self.lens["aperture_radius"],
+                    0,
+                    max(0.1 * size, self.lens["aperture_radius"]),
+                    0.001 * size,
+                    self._aperture,
+                ),
+            ]
+        depth = DEEPEST if self.depth < 0 else self.depth
+        sliders += [
+            Slider("depth", "Depth", depth, 1, max(DEEPEST, depth), 1, self._depth),
+            Slider(
+                "tolerance",
+                "Tolerance",
+                nil.tolerance,
+                min(0.02, nil.tolerance),
+                max(4.0, nil.tolerance),
+                0.01,
+                self._tolerance,
+                "pixels",
+                log=True,
+            ),
+        ]
+        if self.fog or not self._has_media():
+            sliders.append(
+                Slider("fog", "Fog", self.fog, 0, max(2.0, self.fog), 0.01, self._fog, "per cell")
+            )
+        if self.guided:
+            sliders.append(Slider("denoise", "Denoise", 1, 0, 1, 1, self._denoise))
+        return sliders
+
+    def _twist(self, value: float) -> None:
+        self.nil.twist = value
+        self.chart = Chart.of(self.nil)
+        self.pose = self.pose.within(self.chart)
+        self.preview.change()
+        self.look()
+
+    def _exposure(self, value: float) -> None:
+        self.exposure = value
+        self._tell_picture()
+
+    def _filmic(self, value: float) -> None:
+        self.filmic = bool(value)
+        self._tell_picture()
+
+    def _fov(self, value: float) -> None:
+        self.lens["x_fov"] = value
+        self.look()
+
+    def _focus(self, value: float) -> None:
+        self.lens["focus_distance"] = value
+        self.look()
+
+    def _aperture(self, value: float) -> None:
+        self.lens["aperture_radius"] = value
+        self.look()
+
+    def _depth(self, value: float) -> None:
+        self.depth = self.nil.max_depth = -1 if value == DEEPEST else int(value)
+        self.stale = True
+
+    def _tolerance(self, value: float) -> None:
+        self.nil.tolerance = value
+        self.preview.change()
+        self.stale = True
+
+    def _denoise(self, value: float) -> None:
+        self.denoises = bool(value)
+        if self.canvas is None:
+            self.stale = True
+        self.shown = 0  # what there is is shown after the pass in work
+
+    def _fog(self, value: float) -> None:
+        if not (value or self.fog_medium):
+            return
+        self.fog = value
+        fog = Fog(value, self.fog_albedo)
+        # A sensor keeps the medium that it has been given once: one of nothing is no fog
+        if self.fog_medium is None:
+            self.say("Compiling the kernel with fog.", "busy")
+            self.fog_medium = fog.medium(self.nil)
+            self.sensor.set_medium(self.fog_medium)
+            self._prepare()
+        else:
+            fog.thicken(self.fog_medium, self.nil)
+            self.preview.change()
+            self.stale = True
+
+    def _prepare(self) -> None:
+        """Make anew what renders."""
+        from .preview import Preview  # of the current variant
+
+        self.compiled = False
+        self.preview = Preview(self.scene, self.nil, self.sensor, self.guided)
+        self.look()
+        self.preview.change()
+
+    def _has_media(self) -> bool:
+        from .media import has_media  # of the current variant
+
+        return has_media(self.scene, self.sensor)
+
+    @property
+    def fov(self) -> float:
+        """Horizontal, in degrees; of a sensor that has none, about that of a screen."""
+        return self.lens.get("x_fov", 60.0)
+
+    # ------------------------------------------------------------------ what is kept
+
+    def _changed_lens(self) -> dict[str, float]:
+        """The lens's parameters that a scene file has to have other than it has them."""
+        lens = dict(self.lens)
+        if self.lens.get("aperture_radius") == 0:
+            del lens["focus_distance"]  # a pinhole has none
+        return {
+            name: value
+            for name, value in lens.items()
+            if value != self.own_lens.get(name, 0.0 if name == "aperture_radius" else None)
+        }
+
+    def _properties(self) -> list[str]:
+        """The options that say what the sliders do, beside the command's own."""
+        now = {"twist": self.nil.twist, "tolerance": self.nil.tolerance, "max_depth": self.depth}
+        properties = dict(self.job.properties)
+        properties.pop("aovs", None)
+        for name, value in now.items():
+            if value != self.first[name]:
+                properties[name] = number_text(value)
+        words = [word for item in properties.items() for word in ("-P", "=".join(item))]
+        if self.fog:
+            words += ["--fog", number_text(self.fog)]
+            if self.fog_albedo != ALBEDO:
+                words += ["--fog-albedo", number_text(self.fog_albedo)]
+        return words
+
+    def _do_copy(self, _message: dict) -> None:
+        xml = self.text.camera(self.job.sensor, self.pose.to_world(self.chart), **self._lens_now())
+        self.link.send(
+            {
+                "is": "camera",
+                "xml": xml,
+                "options": shlex.join([*self.options, *self._properties()]),
+            }
+        )
+
+    def _lens_now(self) -> dict[str, float | None]:
+        changed = self._changed_lens()
+        return {name: changed.get(name) for name in LENS}
+
+    def _save(self) -> Path:
+        state = {
+            "pose": operator.attrgetter("place", "left", "up", "view")(self.pose),
+            "lens": self._changed_lens(),
+        }
+        if self.saved is None or self.saved[0] != state:
+            path = self.text.save(
+                self.job.sensor, self.pose.to_world(self.chart), **self._lens_now()
+            )
+            self.saved = state, path
+        return self.saved[1]
+
+    def _do_save(self, _message: dict) -> None:
+        self.link.send({"is": "saved", "path": str(self._save())})
+
+    def _do_render(self, _message: dict) -> None:
+        path = self._save()
+        words = ["nil-mitsuba", "render", str(path), *self.options, *self._properties()]
+        words += ["--png", str(path.with_suffix(".png"))]
+        if self.exposure:
+            words += ["--exposure", number_text(self.exposure)]
+        words += ["--filmic"] * self.filmic + ["--denoise"] * self.denoises
+        self.link.send({"is": "command", "command": shlex.join(words), "path": str(path)})
+
+    def _do_key(self, _message: dict) -> None:
+        """Add the camera to those by which a flight leads, in a file beside the scene."""
+        scene = Path(self.job.path)
+        if self.key_path is None:
+            self.key_path = fresh_path(scene, "-keys", ".json")
+        # A flight changes the parameters that its scene's sensor has: those of a lens need a copy
+        lens = {name: self.lens[name] for name in self.own_lens}
+        if self.lens.get("aperture_radius", 0) > self.own_lens.get("aperture_radius", 0):
+            self.key_scene = self.key_scene or self._save()
+        if self.key_scene:
+            lens = dict(self.lens)
+        matrix = self.pose.to_world(self.chart).matrix
+        entries = [float(matrix[i, j]) for i in range(4) for j in range(4)]
+        added = [*self.keys, keys.Key(entries, self.pose.cell, lens)]
+        keys.save(self.key_path, added)
+        self.keys = added
+        words = ["nil-mitsuba", "fly", str(self.key_scene or scene)]
+        words += [*self.options, *self._properties(), "--keys", str(self.key_path)]
+        words += ["--frames", "120", "-o", str(scene.with_name(f"{scene.stem}-frames"))]
+        self.link.send(
+            {
+                "is": "keys",
+                "count": len(self.keys),
+                "path": str(self.key_path),
+                "command": shlex.join(words),
+            }
+        )
+
+
+def lens_of(sensor: mi.Sensor) -> dict[str, float]:
+    """The parameters of a sensor that a lens may change."""
+    parameters = mi.traverse(sensor)
+    return {name: float(_one(parameters[name])) for name in LENS if name in parameters}
+
+
+def viewing_sensor(own: mi.Sensor, nil: mi.Integrator) -> tuple[mi.Sensor, dict[str, float]]:
+    """A sensor that sees what a scene's own sees, and its lens's parameters.
+
+    A pinhole becomes a lens with an aperture of nothing, so that an aperture needs no other kernel.
+    Raises RuntimeError for a sensor that cannot be moved.
+    """
+    parameters = mi.traverse(own)
+    kind = own.class_name()
+    if kind in ("BatchSensor", "RadianceMeter") or "to_world" not in parameters:
+        raise RuntimeError(
+            f'the viewfinder cannot walk with the sensor "{kind}": name another by -s, or look '
+            "through a copy of the scene with a perspective one."
+        )
+    lens = lens_of(own)
+    shifted = any(
+        _one(parameters[name])
+        for name in ("principal_point_offset_x", "principal_point_offset_y")
+        if name in parameters
+    )
+    if kind != "PerspectiveCamera" or shifted:
+        return own, lens
+    film = own.film()
+    (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
+    crop_x, crop_y = film.crop_offset()
+    lens |= {"focus_distance": 2.0 * nil.cell_size, "aperture_radius": 0.0}
+    description = {
+        "type": "thinlens",
+        "fov": lens["x_fov"],
+        "fov_axis": "x",
+        "focus_distance": lens["focus_distance"],
+        "aperture_radius": 1.0,  # of 0 Mitsuba would warn
+        "near_clip": own.near_clip(),
+        "far_clip": own.far_clip(),
+        "shutter_open": own.shutter_open(),
+        "shutter_close": own.shutter_open() + own.shutter_open_time(),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "crop_width": crop_width,
+            "crop_height": crop_height,
+            "crop_offset_x": crop_x,
+            "crop_offset_y": crop_y,
+        },
+    }
+    if own.get_medium() is not None:
+        description["medium"] = own.get_medium()
+    return mi.load_dict(description), lens
+
+
+def can_denoise() -> bool:
+    """Whether the denoiser is installed."""
+    import importlib.util
+
+    return importlib.util.find_spec("mitsuba_oidn") is not None
+
+
+def fresh_path(scene: Path, ending: str, suffix: str) -> Path:
+    """A name beside a scene that no file has."""
+    number = 1
+    while True:
+        path = scene.with_name(f"{scene.stem}{ending}{'' if number == 1 else f'-{number}'}{suffix}")
+        if not os.path.lexists(path):
+            return path
+        number += 1
+
+
+def _one(value) -> float:
+    return value[0] if dr.is_array_v(value) else value
