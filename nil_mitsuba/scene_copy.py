@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from xml.parsers import expat
 
 import mitsuba as mi
@@ -30,6 +30,9 @@ FOCUS = ("perspective", "thinlens", "orthographic")
 TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 ATTRIBUTE = re.compile(rb"""\s([^\s=]+)\s*=\s*("[^"]*"|'[^']*')""")
 LATIN = re.compile(rb"""<\?xml\s[^>]*?encoding\s*=\s*["'](?:iso-8859-1|latin1)["']""", re.I)
+
+# Names of properties, and the lines that take the place of all of these
+Group: TypeAlias = tuple[Sequence[str], list[str]]
 
 
 @dataclass(frozen=True)
@@ -61,20 +64,17 @@ class SceneText:
         self._codec = _codec_of(raw)
         # In UTF-8, as Mitsuba counts; bytes that are none are kept
         self._text = _utf8(raw.decode(self._codec, "surrogateescape"))
-        self._state = SceneFiles(str(path), defines or {}, {}).rest
+        self._defines = defines or {}
+        self._state = SceneFiles(str(path), self._defines, {}).rest
 
-    def camera(
-        self, sensor: int, to_world: mi.ScalarTransform4f, **lens: float | None
-    ) -> str:
+    def camera(self, sensor: int, to_world: mi.ScalarTransform4f, **lens: float | None) -> str:
         """The element of a sensor with another ``to_world`` and :class:`Lens`, to be pasted."""
         start, _, element = self._edited(sensor, to_world, Lens(**lens))
         margin = _margin(self._text, start)
         lines = element.replace(b"\r\n", b"\n").split(b"\n")
         return b"\n".join(line.removeprefix(margin) for line in lines).decode("utf-8", "replace")
 
-    def with_camera(
-        self, sensor: int, to_world: mi.ScalarTransform4f, **lens: float | None
-    ) -> str:
+    def with_camera(self, sensor: int, to_world: mi.ScalarTransform4f, **lens: float | None) -> str:
         """The text of the file with another ``to_world`` and :class:`Lens` of a sensor."""
         return self._with(sensor, to_world, Lens(**lens)).decode("utf-8", "replace")
 
@@ -94,43 +94,34 @@ class SceneText:
             raise
         return path
 
+    def defines(
+        self, sensor: int, to_world: mi.ScalarTransform4f, **lens: float | None
+    ) -> dict[str, str]:
+        """The constants that such a text still refers to: Mitsuba takes no others."""
+        included = [Path(str(name)).read_bytes() for name in list(self._state.files)[1:]]
+        text = b"\n".join([self._with(sensor, to_world, Lens(**lens)), *included])
+        text = re.sub(b"<!--.*?-->", b"", text, flags=re.S)
+        found = {}
+        for name in sorted(self._defines, key=len, reverse=True):  # $x may begin as $xy does
+            key = b"$" + _utf8(name)
+            if key in text:
+                found[name] = self._defines[name]
+            text = text.replace(key, b"")
+        return {name: found[name] for name in self._defines if name in found}
+
     def _with(self, sensor, to_world, lens):
         start, end, element = self._edited(sensor, to_world, lens)
         return self._text[:start] + element + self._text[end:]
 
     def _edited(self, sensor, to_world, lens):
         """Where a sensor's element begins and ends, and what takes its place."""
-        node = self._node(sensor)
-        kind = node.props.plugin_name()
-        changed = _kind(kind, lens)
-        groups = [(PLACES, _transform(to_world))]
-        if lens.x_fov is not None:
-            if kind not in FOV:
-                raise ValueError(f"{self._name(sensor)} is of the type "{kind}", which has no fov.")
-            fov = [_float("fov", lens.x_fov), '<string name="fov_axis" value="x"/>']
-            groups.append((VIEWS, fov))
-        if lens.focus_distance is not None:
-            if kind not in FOCUS:
-                raise ValueError(f"{self._name(sensor)} is of the type "{kind}", which has no focus.")
-            groups.append((("focus_distance",), [_float("focus_distance", lens.focus_distance)]))
-        if changed == "thinlens" and lens.aperture_radius is not None:
-            groups.append((("aperture_radius",), [_float("aperture_radius", lens.aperture_radius)]))
-        elif changed == "perspective":
-            groups.append((("aperture_radius",), []))
-        elif lens.aperture_radius:
-            raise ValueError(f"{self._name(sensor)} is of the type "{kind}", which has no aperture.")
-        if (kind, changed) == ("perspective", "thinlens"):
-            if any(node.props.get(name, 0) for name in OFFSETS):
-                raise ValueError(
-                    f"{self._name(sensor)} has a {OFFSETS[0][:-2]}, which no thinlens has: remove "
-                    "it, or close the aperture."
-                )
-            groups.append((OFFSETS, []))  # exporters write zeros
-
-        element = _parse(self._text, node.offset - 1, self._name(sensor))
+        node, name = self._node(sensor), self._name(sensor)
+        kind, lines = _lens(node.props, lens, name)
+        groups = [(PLACES, _transform(to_world)), *lines]
+        element = _parse(self._text, node.offset - 1, name)
         edits = _edits(self._text, element, groups)
-        if changed != kind:
-            edits.append((*element.kind, changed.encode()))
+        if kind != node.props.plugin_name():
+            edits.append((*element.kind, kind.encode()))
         return element.start, element.end, _replaced(self._text, element, edits)
 
     def _name(self, sensor):
@@ -200,11 +191,37 @@ def _utf8(text: str) -> bytes:
     return text.encode("utf-8", "surrogateescape")
 
 
-def _kind(kind: str, lens: Lens) -> str:
-    """The type of a sensor with a lens."""
-    if kind not in ("perspective", "thinlens") or lens.aperture_radius is None:
-        return kind
-    return "thinlens" if lens.aperture_radius > 0 else "perspective"
+def _lens(props: mi.Properties, lens: Lens, name: str) -> tuple[str, list[Group]]:
+    """The type of a sensor with a lens, and the lines for it; ``name`` is what errors call it."""
+    kind = props.plugin_name()
+
+    def only(kinds, what):
+        if kind not in kinds:
+            raise ValueError(f'{name} is of the type "{kind}", which has no {what}.')
+
+    groups: list[Group] = []
+    if lens.x_fov is not None:
+        only(FOV, "fov")
+        lines = [_float("fov", lens.x_fov), '<string name="fov_axis" value="x"/>']
+        groups.append((VIEWS, lines))
+    if lens.focus_distance is not None:
+        only(FOCUS, "focus_distance")
+        groups.append((("focus_distance",), [_float("focus_distance", lens.focus_distance)]))
+    if lens.aperture_radius is None:
+        return kind, groups
+
+    if lens.aperture_radius == 0:
+        groups.append((("aperture_radius",), []))
+        return "perspective" if kind == "thinlens" else kind, groups
+    only(("perspective", "thinlens"), "aperture_radius")
+    groups.append((("aperture_radius",), [_float("aperture_radius", lens.aperture_radius)]))
+    if any(props.get(offset, 0) for offset in OFFSETS):
+        raise ValueError(
+            f"{name} has a {OFFSETS[0][:-2]}, which no thinlens has: remove it, or close the "
+            "aperture."
+        )
+    groups.append((OFFSETS, []))  # exporters write zeros
+    return "thinlens", groups
 
 
 def _float(name, value):
@@ -294,13 +311,8 @@ def _closes_itself(text, start):
     return _tag(text, start)[0].endswith(b"/>")
 
 
-def _edits(
-    text: bytes, element: _Element, groups: list[tuple[Sequence[str], list[str]]]
-) -> list[tuple[int, int, bytes]]:
-    """Extents (bytes) in a sensor's element, and what takes their place.
-
-    ``groups``: names of properties, and the lines that take the place of these.
-    """
+def _edits(text: bytes, element: _Element, groups: list[Group]) -> list[tuple[int, int, bytes]]:
+    """Extents (bytes) in a sensor's element, and what takes their place."""
     base = _margin(text, element.start)
     margins = [_margin(text, child.start) for child in element.children if _leads(text, child)]
     unit = b"\t" if base.startswith(b"\t") else b"    "
@@ -357,13 +369,13 @@ def _leads(text: bytes, child: _Child) -> bool:
 
 
 def _extent(text: bytes, child: _Child) -> tuple[int, int]:
-    """What goes with an element: its line, if that holds nothing else."""
-    after = text[child.end :].lstrip(b" \t")
-    if _leads(text, child) and after.startswith((b"\n", b"\r\n")):
-        before = text[: child.start].rstrip(b" \t")
-        before = before.removesuffix(b"\n").removesuffix(b"\r")
-        return len(before), len(text) - len(after)
-    return child.start, child.end
+    """What goes with an element: its line, if that holds nothing else, or the blanks before it."""
+    before, after = text[: child.start].rstrip(b" \t"), text[child.end :].lstrip(b" \t")
+    if not _leads(text, child):
+        return len(before), child.end
+    if not after.startswith((b"\n", b"\r\n")):
+        return child.start, child.end
+    return len(before.removesuffix(b"\n").removesuffix(b"\r")), len(text) - len(after)
 
 
 def _replaced(text: bytes, element: _Element, edits: list[tuple[int, int, bytes]]) -> bytes:
