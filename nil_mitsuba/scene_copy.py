@@ -40,7 +40,7 @@ class Lens:
     """A camera's lens; what is None stays as the file has it.
 
     ``x_fov``: the horizontal field of view (degrees). ``focus_distance``, ``aperture_radius``:
-    scene units; a radius makes the sensor a "thinlens", and 0 makes it "perspective".
+    scene units; a radius makes a "perspective" camera a "thinlens", and 0 makes that one again.
     """
 
     x_fov: float | None = None
@@ -52,7 +52,7 @@ class SceneText:
     """The text of a scene file, as it was when it was read.
 
     ``path`` is that of the file, and ``defines`` are the constants that the scene refers to. Raises
-    OSError, ValueError or RuntimeError with a sentence if Mitsuba cannot read it.
+    OSError if it cannot be read, and ValueError or RuntimeError with a sentence if it is no scene.
 
     Sensors have the numbers of ``scene.sensors()``. Their methods raise ValueError with a sentence
     for a sensor that the file does not hold, or that cannot be such a camera.
@@ -211,8 +211,10 @@ def _lens(props: mi.Properties, lens: Lens, name: str) -> tuple[str, list[Group]
         return kind, groups
 
     if lens.aperture_radius == 0:
+        if kind != "thinlens":
+            return kind, groups
         groups.append((("aperture_radius",), []))
-        return "perspective" if kind == "thinlens" else kind, groups
+        return "perspective", groups
     only(("perspective", "thinlens"), "aperture_radius")
     groups.append((("aperture_radius",), [_float("aperture_radius", lens.aperture_radius)]))
     if any(props.get(offset, 0) for offset in OFFSETS):

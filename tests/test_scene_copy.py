@@ -1,7 +1,6 @@
 """Copies of scene files with another camera, and all else as it was."""
 
 import codecs
-import math
 import re
 from concurrent.futures import ThreadPoolExecutor
 
@@ -77,9 +76,7 @@ def changed(file):
         after = mi.load_file(str(text.save(0, to_world, **lens))).sensors()[0]
         assert_same(after.world_transform(), to_world)
         pasted = path.read_text().replace(camera, text.camera(0, to_world, **lens))
-        pasted = mi.load_string(pasted).sensors()[0]
-        assert_same(pasted.world_transform(), to_world)
-        assert values(pasted) == values(after)
+        assert pasted.split() == text.with_camera(0, to_world, **lens).split()
         return before, after
 
     return change
@@ -526,6 +523,6 @@ def test_what_cannot_be_saved_leaves_nothing(file, monkeypatch):
 def test_a_file_that_changes_later_is_copied_as_it_was(file):
     path = file(scene(looking(10)))
     text = SceneText(path)
+    copied = text.with_camera(0, elsewhere())
     path.write_text("gone")
-    assert math.isfinite(len(text.with_camera(0, elsewhere())))
-    assert BALL not in text.with_camera(0, elsewhere())
+    assert text.save(0, elsewhere()).read_text() == copied
