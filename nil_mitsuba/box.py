@@ -122,10 +122,12 @@ class Occupied:
 
     def __init__(self, boxes: Iterable[mi.ScalarBoundingBox3f], space: Space):
         """``boxes``: those of a scene's shapes (scene units)."""
+        # Kernels of the first pass and of others would differ in where they compute what is not in
+        # memory, and be compiled twice
         self.boxes = [
             Box(
-                space.to_cells(opaque(mi.Point3f(box.min))),
-                space.to_cells(opaque(mi.Point3f(box.max))),
+                opaque(space.to_cells(opaque(mi.Point3f(box.min)))),
+                opaque(space.to_cells(opaque(mi.Point3f(box.max)))),
             )
             for box in gathered(boxes, space.size_number)
         ]
@@ -134,6 +136,7 @@ class Occupied:
         for box in self.boxes[1:]:
             self.lower = dr.minimum(self.lower, box.lower)
             self.upper = dr.maximum(self.upper, box.upper)
+        dr.make_opaque(self.lower, self.upper)
 
     def excludes(self, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies outside of all."""

@@ -94,7 +94,7 @@ class Clearance:
 
     def _add_levels(self, pieces, focus, finest, levels):
         n = FOCUS_VOXELS
-        self.focus = self.space.to_cells(opaque(mi.Point3f(focus)))
+        self.focus = opaque(self.space.to_cells(opaque(mi.Point3f(focus))))
         self.per_half = opaque(mi.Float(2 / (n * finest)))
         self.first = opaque(mi.Int32(levels))  # none of them holds anything yet
         self.count = opaque(mi.Int32(levels))

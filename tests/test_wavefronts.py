@@ -158,6 +158,21 @@ def test_no_size_of_a_wavefront_compiles_anything(rgb, cut):
     assert all(further <= hashes[0] for further in hashes[1:])
 
 
+@pytest.mark.parametrize("quotient", [True, False])
+def test_no_pass_compiles_anything_after_the_first(rgb, quotient):
+    from nil_mitsuba.passes import Passes
+
+    loaded = mi.load_dict(description(quotient=quotient))
+    passes = Passes(loaded.integrator(), loaded, 0, pass_spp=16)
+    hashes = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for index in range(3):
+            dr.kernel_history_clear()
+            passes.render(index)
+            hashes.append({entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])})
+    assert all(further <= hashes[0] for further in hashes[1:])
+
+
 def test_layers_come_from_the_paths_of_the_picture(rgb, cut):
     loaded = mi.load_dict(description(aovs="cell, shape, position"))
     cut(100)
