@@ -76,6 +76,10 @@ class Camera:
         p, v = geometry.flow(p, v, near, space.twist)
         return p, space.to_scene_axes(v), cone, far, first
 
+    def near(self, ray: mi.RayDifferential3f, across: mi.Float) -> mi.Float:
+        """The length (scene) of the way to a ray's start, `across` as of `start`."""
+        return self._view(ray, across)[1]
+
     def _step(self, v):
         """A vector (scene) as what a point (cells) is multiplied by."""
         return self.space.to_cell_axes(mi.Point3f(v * self.space.cells_per_unit))

@@ -520,10 +520,7 @@ def _viewfinder(job: jobs.Job, link):
         notes.append(sentence)
 
     opened = jobs.open_scene(job, note, aiming=True)
-    options = [] if job.variant == "llvm_ad_rgb" else ["-m", job.variant]
-    options += [word for item in job.defines.items() for word in ("-D", "=".join(item))]
-    options += ["-s", str(job.sensor)] if job.sensor else []
-    return Viewfinder(opened, options, notes, link)
+    return Viewfinder(opened, notes, link)
 
 
 @cli.command()

@@ -15,7 +15,7 @@ from .interaction import surface_interaction
 from .layers import GUIDES
 from .media import has_media
 from .passes import sample_seeds
-from .quotient import multiply_cells
+from .quotient import multiply_cells, opaque
 from .shapes import name_of
 from .view import View
 
@@ -81,11 +81,12 @@ class Preview:
         self.film_width = int(crop[0])
         self.view: View | None = None
 
-    def look(self, to_world: mi.ScalarTransform4f, **lens: float) -> None:
+    def look(self, to_world: mi.ScalarTransform4f | mi.Transform4f, **lens: float) -> None:
         """Place the sensor; ``lens`` are parameters of it."""
-        self.parameters["to_world"] = mi.Transform4f(to_world)
+        # Opaque: what Mitsuba computes from them needs no other kernel for each place
+        self.parameters["to_world"] = mi.Transform4f(opaque(mi.Matrix4f(to_world.matrix)))
         for name, value in lens.items():
-            self.parameters[name] = value
+            self.parameters[name] = dr.opaque(mi.Float, value)
         self.parameters.update()
         if self.view is not None:
             self.camera = Camera(self.sensor, self.view.space, self.integrator.tolerance)
@@ -184,7 +185,7 @@ class Preview:
         hit = tracer.intersect(p, v, cone, tracer.reach(p, v, far), mi.Bool(True), time)
         si = surface_interaction(hit, v, space, ray.wavelengths)
         cell = multiply_cells(home, hit.cell, space)
-        distance = hit.distance * space.size
+        distance = self.camera.near(ray, on_film.x) + hit.distance * space.size
         dr.eval(si, cell, distance, first)
         direction = _numbers(first)
         if not si.is_valid()[0]:

@@ -7,7 +7,6 @@ described there. Everything runs in one thread.
 from __future__ import annotations
 
 import math
-import operator
 import os
 import shlex
 import time
@@ -23,15 +22,16 @@ from . import jobs, keys
 from .errors import cause_of
 from .fog import ALBEDO, Fog
 from .pose import Chart, Pose
+from .registration import WORKING_VARIANT
 from .scene_copy import SceneText
 from .scene_files import number_text
 
 if TYPE_CHECKING:
     from .preview import Canvas, Preview
 
-# While something moves, a picture should take about so long: twice the five a second that a walk
-# needs at least. Sizes grow and shrink by this factor where it takes less or more.
-FRAME_SECONDS, STEP = 0.1, math.sqrt(2)
+# While something moves, a picture should take about so long: eight a second. Its size grows and
+# shrinks by this factor where it takes much less or more.
+FRAME_SECONDS, STEP = 0.125, math.sqrt(2)
 SMALLEST = 160  # pixels wide; a coarser picture shows nothing
 
 # Paths are so long while something moves. Longer ones change little but inside glass.
@@ -112,14 +112,13 @@ class Slider:
 class Viewfinder:
     """A loaded scene with a camera that moves.
 
-    ``opened`` is the scene, with ids of shapes; ``options`` are those of the command that say
-    which scene it is, for the commands that are shown; ``notes`` are sentences on the scene. Raises
-    RuntimeError or ValueError if the scene cannot be walked through.
+    ``opened`` is the scene, with ids of shapes; ``notes`` are sentences on it. Raises RuntimeError
+    or ValueError if it cannot be walked through.
     """
 
-    def __init__(self, opened: jobs.Opened, options: list[str], notes: list[str], link: Link):
+    def __init__(self, opened: jobs.Opened, notes: list[str], link: Link):
         self.job, self.scene, self.nil = opened.job, opened.scene, opened.nil
-        self.options, self.notes, self.link = options, notes, link
+        self.notes, self.link = notes, link
         own = self.scene.sensors()[self.job.sensor]
         self.sensor, self.lens = viewing_sensor(own, self.nil)
         self.text = SceneText(self.job.path, self.job.defines)
@@ -158,8 +157,8 @@ class Viewfinder:
         self.pointed: list[float] | None = None
         self.keys: list[keys.Key] = []
         self.key_path: Path | None = None
-        self.key_scene: Path | None = None  # a copy, where the scene's own sensor has no lens
-        self.saved: tuple[dict, Path] | None = None  # the last copy, and what it holds
+        self.key_copy: Copy | None = None  # which they need, if the scene's own sensor has no lens
+        self.saved: tuple[tuple, Copy] | None = None  # the last copy, and what it holds
         self._prepare()
 
     # ------------------------------------------------------------------ the loop
@@ -562,58 +561,54 @@ class Viewfinder:
             if value != self.own_lens.get(name, 0.0 if name == "aperture_radius" else None)
         }
 
-    def _properties(self) -> list[str]:
-        """The options that say what the sliders do, beside the command's own."""
-        now = {"twist": self.nil.twist, "tolerance": self.nil.tolerance, "max_depth": self.depth}
-        properties = dict(self.job.properties)
+    def _options(self, defines: dict[str, str]) -> list[str]:
+        """The command's options that say which scene it is, and in which space."""
+        words = [] if self.job.variant == WORKING_VARIANT else ["-m", self.job.variant]
+        words += [word for item in defines.items() for word in ("-D", "=".join(item))]
+        words += ["-s", str(self.job.sensor)] if self.job.sensor else []
+        properties = {**self.job.properties}
         properties.pop("aovs", None)
-        for name, value in now.items():
-            if value != self.first[name]:
-                properties[name] = number_text(value)
-        words = [word for item in properties.items() for word in ("-P", "=".join(item))]
+        now = {"twist": self.nil.twist, "tolerance": self.nil.tolerance, "max_depth": self.depth}
+        properties |= {
+            name: number_text(value) for name, value in now.items() if value != self.first[name]
+        }
+        words += [word for item in properties.items() for word in ("-P", "=".join(item))]
         if self.fog:
             words += ["--fog", number_text(self.fog)]
             if self.fog_albedo != ALBEDO:
                 words += ["--fog-albedo", number_text(self.fog_albedo)]
         return words
 
-    def _do_copy(self, _message: dict) -> None:
-        xml = self.text.camera(self.job.sensor, self.pose.to_world(self.chart), **self._lens_now())
-        self.link.send(
-            {
-                "is": "camera",
-                "xml": xml,
-                "options": shlex.join([*self.options, *self._properties()]),
-            }
-        )
-
-    def _lens_now(self) -> dict[str, float | None]:
+    def _edit(self, edit: Callable):
+        """A method of the scene's text, for the camera that there is now."""
         changed = self._changed_lens()
-        return {name: changed.get(name) for name in LENS}
+        lens = {name: changed.get(name) for name in LENS}
+        return edit(self.job.sensor, self.pose.to_world(self.chart), **lens)
 
-    def _save(self) -> Path:
-        state = {
-            "pose": operator.attrgetter("place", "left", "up", "view")(self.pose),
-            "lens": self._changed_lens(),
-        }
+    def _do_copy(self, _message: dict) -> None:
+        options = self._options(self._edit(self.text.defines))
+        xml = self._edit(self.text.camera)
+        self.link.send({"is": "camera", "xml": xml, "options": shlex.join(options)})
+
+    def _save(self) -> Copy:
+        """A copy of the scene with this camera; that which there is already, if there is one."""
+        state = self.pose.place, self.pose.view, self.pose.up, self._changed_lens()
         if self.saved is None or self.saved[0] != state:
-            path = self.text.save(
-                self.job.sensor, self.pose.to_world(self.chart), **self._lens_now()
-            )
-            self.saved = state, path
+            copy = Copy(self._edit(self.text.save), self._edit(self.text.defines))
+            self.saved = state, copy
         return self.saved[1]
 
     def _do_save(self, _message: dict) -> None:
-        self.link.send({"is": "saved", "path": str(self._save())})
+        self.link.send({"is": "saved", "path": str(self._save().path)})
 
     def _do_render(self, _message: dict) -> None:
-        path = self._save()
-        words = ["nil-mitsuba", "render", str(path), *self.options, *self._properties()]
-        words += ["--png", str(path.with_suffix(".png"))]
+        copy = self._save()
+        words = ["nil-mitsuba", "render", str(copy.path), *self._options(copy.defines)]
+        words += ["--png", str(copy.path.with_suffix(".png"))]
         if self.exposure:
             words += ["--exposure", number_text(self.exposure)]
         words += ["--filmic"] * self.filmic + ["--denoise"] * self.denoises
-        self.link.send({"is": "command", "command": shlex.join(words), "path": str(path)})
+        self.link.send({"is": "command", "command": shlex.join(words), "path": str(copy.path)})
 
     def _do_key(self, _message: dict) -> None:
         """Add the camera to those by which a flight leads, in a file beside the scene."""
@@ -622,18 +617,19 @@ class Viewfinder:
             self.key_path = fresh_path(scene, "-keys", ".json")
         # A flight changes the parameters that its scene's sensor has: those of a lens need a copy
         lens = {name: self.lens[name] for name in self.own_lens}
-        if self.lens.get("aperture_radius", 0) > self.own_lens.get("aperture_radius", 0):
-            self.key_scene = self.key_scene or self._save()
-        if self.key_scene:
+        if self.lens.get("aperture_radius", 0) > 0 and "aperture_radius" not in self.own_lens:
+            self.key_copy = self.key_copy or self._save()
+        if self.key_copy:
             lens = dict(self.lens)
         matrix = self.pose.to_world(self.chart).matrix
         entries = [float(matrix[i, j]) for i in range(4) for j in range(4)]
         added = [*self.keys, keys.Key(entries, self.pose.cell, lens)]
         keys.save(self.key_path, added)
         self.keys = added
-        words = ["nil-mitsuba", "fly", str(self.key_scene or scene)]
-        words += [*self.options, *self._properties(), "--keys", str(self.key_path)]
-        words += ["--frames", "120", "-o", str(scene.with_name(f"{scene.stem}-frames"))]
+        flown = self.key_copy or Copy(scene, self.job.defines)
+        words = ["nil-mitsuba", "fly", str(flown.path), *self._options(flown.defines)]
+        words += ["--keys", str(self.key_path), "--frames", "120"]
+        words += ["-o", str(scene.with_name(f"{scene.stem}-frames"))]
         self.link.send(
             {
                 "is": "keys",
@@ -642,6 +638,14 @@ class Viewfinder:
                 "command": shlex.join(words),
             }
         )
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A scene file with a camera that was found here, and the constants that it refers to."""
+
+    path: Path
+    defines: dict[str, str]
 
 
 def lens_of(sensor: mi.Sensor) -> dict[str, float]:
