@@ -13,6 +13,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 import queue
 import re
 import secrets
@@ -151,6 +152,7 @@ class Link:
         self.url = url
         self._changed = threading.Condition()
         self._inbox: list[dict[str, Any]] = []
+        self._drawn = False  # a frame, since the last look
         self._viewer: _Viewer | None = None
 
     @property
@@ -167,13 +169,12 @@ class Link:
     def messages(self, wait: float) -> list[dict[str, Any]]:
         """All that has come from the page since the last call.
 
-        Waits for up to ``wait`` seconds if that is nothing, but not beyond the moment from which a
-        frame can be shown again.
+        Waits for up to ``wait`` seconds if nothing has come. That a frame has been drawn is not
+        among the messages, but ends the wait: another one can be shown.
         """
         with self._changed:
-            ready = self.ready
-            self._changed.wait_for(lambda: self._inbox or self.ready > ready, wait)
-            taken, self._inbox = self._inbox, []
+            self._changed.wait_for(lambda: self._inbox or self._drawn, wait)
+            taken, self._inbox, self._drawn = self._inbox, [], False
         return taken
 
     def send(self, event: dict[str, Any]) -> None:
@@ -242,6 +243,7 @@ class Link:
         with self._changed:
             if message["do"] == "drawn":
                 viewer.drawn(message["frame"])
+                self._drawn = True
             else:
                 self._inbox.append(message)
             self._changed.notify_all()
@@ -295,7 +297,8 @@ def serve(port: int = 0) -> Iterator[Link]:
         # To this computer only, whatever "localhost" may mean on it
         listener = socket.create_server(("127.0.0.1", port))
     except OSError as error:
-        raise OSError(f"cannot serve the page at 127.0.0.1:{port}: {error.strerror}.") from error
+        reason = os.strerror(error.errno or 0)  # Python adds the address to its own
+        raise OSError(f"cannot serve the page at 127.0.0.1:{port}: {reason}.") from error
     door = _Door(listener.getsockname()[1])
     link = Link(door.url)
     # Browsers open connections ahead and drop them, which the library would complain about
@@ -351,8 +354,11 @@ class _Door:
         # A name of somebody else's that leads here would make its pages ours, or ours its
         if not _one_of(request.headers.get_all("Host"), self.hosts):
             return connection.respond(HTTPStatus.FORBIDDEN, "This is not the host's name.\n")
-        if getattr(request, "method", "GET") != "GET":  # older versions of the library know no other
-            return connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "There is only a page to get.\n")
+        # Older versions of the library know no other method, and no attribute that says so
+        if getattr(request, "method", "GET") != "GET":
+            return connection.respond(
+                HTTPStatus.METHOD_NOT_ALLOWED, "There is only a page to get.\n"
+            )
         token, _, rest = request.path.removeprefix("/").partition("/")
         if not secrets.compare_digest(token.encode(), self.token.encode()):
             return connection.respond(

@@ -7,8 +7,9 @@ import mitsuba as mi
 SLIDERS = [
     ("twist", "Twist", 0, 1, 0.01, 1, False, "", ""),
     ("exposure", "Exposure", -8, 8, 0.1, 0, False, "stops", ""),
+    ("filmic", "Filmic", 0, 1, 1, 0, False, "", ""),
     ("fov", "Field of view", 10, 120, 1, 60, False, "°", ""),
-    ("focus_distance", "Focus", 0.1, 100, None, 3, True, "", ""),
+    ("focus_distance", "Focus", 0.1, 100, None, 1, True, "", ""),
     ("aperture_radius", "Aperture", 0, 0.5, 0.005, 0, False, "", ""),
     ("tolerance", "Tolerance", 1e-4, 1e-1, None, 1e-2, True, "", ""),
     ("max_depth", "Depth", 1, 32, 1, 8, False, "", "Compiles again, once."),
@@ -32,13 +33,22 @@ class Engine:
         self.room = None
         self.frame = 0
         self.keys = 0
+        self.scale = 1  # so many pixels of the screen are one of the picture
+        self.many = 0  # frames to show beside those that are asked for
         self.done = threading.Event()
+        self.error = None
 
     def run(self):
-        while not self.done.is_set():
-            for message in self.link.messages(0.02):
-                self.heard.append(message)
-                getattr(self, message["do"])(**{k: v for k, v in message.items() if k != "do"})
+        try:
+            while not self.done.is_set():
+                for message in self.link.messages(0.02):
+                    self.heard.append(message)
+                    getattr(self, message["do"])(**{k: v for k, v in message.items() if k != "do"})
+                while self.many:
+                    self.many -= 1
+                    self.show()
+        except Exception as error:  # for the test to raise: this is a thread of its own
+            self.error = error
 
     def heard_of(self, do):
         return [message for message in self.heard if message["do"] == do]
@@ -104,7 +114,6 @@ class Engine:
         )
 
     def home(self):
-        self.place = [0.7, 0.3]
         self.show()
 
     def bye(self):
@@ -119,7 +128,6 @@ class Engine:
                 "title": "room",
                 "aspect": 16 / 9,
                 "sliders": list(self.sliders.values()),
-                "shape_known": True,
             }
         )
 
@@ -127,7 +135,7 @@ class Engine:
         if not self.room:
             return
         width, height = self.room
-        width = min(width, round(height * 16 / 9))
+        width = min(width, round(height * 16 / 9)) // self.scale
         height = round(width * 9 / 16)
         self.frame += 1
         header = {

@@ -42,7 +42,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
         info = [name for name in archive.namelist() if ".dist-info/" in name]
     modules = {f"nil_mitsuba/{path.name}" for path in (ROOT / "nil_mitsuba").glob("*.py")}
-    assert names == modules | {"nil_mitsuba/py.typed"}
+    assert names == modules | {"nil_mitsuba/py.typed", "nil_mitsuba/viewfinder.html"}
     assert any(name.endswith("/licenses/LICENSE") for name in info)
     assert any(name.endswith("/entry_points.txt") for name in info)
 
