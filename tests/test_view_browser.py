@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+import time
 
 import drjit as dr
 import mitsuba as mi
@@ -418,8 +419,10 @@ def test_a_page_that_is_loaded_again_goes_on(page):
 
 def test_the_end_is_said(page):
     page.engine.link.send({"is": "end", "text": "The command has ended."})
+    page.engine.link.send({"is": "says", "kind": "note", "text": "A word too late."})
     page.wait(lambda: page.state == "ended")
-    assert page.text("veil-text") == "The command has ended."
+    time.sleep(0.1)
+    assert page.state == "ended" and page.text("veil-text") == "The command has ended."
 
 
 def test_a_command_that_ends_without_a_word_is_noticed(window, rgb):
