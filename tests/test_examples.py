@@ -77,7 +77,7 @@ def test_walk_writes_frames_for_a_film(rgb, tmp_path):
         "--spp",
         "1",
     )
-    assert [path.name for path in sorted((tmp_path / "film").iterdir())] == ["000.png", "001.png"]
+    assert [path.name for path in sorted((tmp_path / "film").iterdir())] == ["0000.png", "0001.png"]
 
 
 def test_walk_of_four_cells_comes_back_one_storey_higher(rgb):
