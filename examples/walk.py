@@ -2,8 +2,7 @@
 
 From x = 1/4 straight ahead along y, four cells lead back to the start, one storey higher: by
 (x, y, z + k x y) the walk is closed at twist 1. So two cameras tell the whole of it, of which the
-second is the first, in another cell. With ffmpeg:
-``ffmpeg -framerate 25 -i frames/%04d.png -pix_fmt yuv420p walk.mp4``.
+second is the first, in another cell: scenes/showcase-walk.json.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ import nil_mitsuba  # noqa: F401 - before mitsuba: it chooses the LLVM that Dr.J
 # isort: split
 import mitsuba as mi
 
-from nil_mitsuba import keys
 from sheet import contact_sheet
 
 SHOWCASE = Path(__file__).resolve().parents[1] / "scenes" / "showcase.xml"
+WALK = SHOWCASE.with_name("showcase-walk.json")
 
 
 def main():
@@ -36,15 +35,10 @@ def main():
     options = parser.parse_args()
 
     mi.set_variant("llvm_ad_rgb")
-    # A camera's rotation is read in frame components: E3 stays upright, whatever the place
-    camera = mi.ScalarTransform4f().look_at([0.25, 0, 0.655], [0.25, 1, 0.655], [0, 0, 1]).matrix
-    matrix = [camera[i, j] for i in range(4) for j in range(4)]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(options.frames_to or Path(scratch) / "frames")
-        cameras = Path(scratch) / "cameras.json"
-        keys.save(cameras, [keys.Key(matrix), keys.Key(matrix, cell=(0, 4, 1))])
         command = [sys.executable, "-c", "from nil_mitsuba.cli import main; main()"]
-        command += ["fly", str(SHOWCASE), "--keys", str(cameras), "--frames", str(options.frames)]
+        command += ["fly", str(SHOWCASE), "--keys", str(WALK), "--frames", str(options.frames)]
         command += ["-o", str(folder), "--format", "png", "--spp", str(options.spp)]
         command += ["-D", f"resx={options.size}", "-D", f"resy={options.size * 9 // 16}"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
