@@ -957,7 +957,7 @@ def _fly(options: FlyOptions) -> None:
         + (": behind its last frame comes its first." if flight.loop else ".")
     )
     rendered: Iterator[checkpoint.Checkpoint | None]
-    display = _FramesDisplay(plan.count, kept, options.quiet)
+    display = _FramesDisplay(frames, kept, options.quiet)
     if options.clustered:
         from . import cluster
 
@@ -973,7 +973,7 @@ def _fly(options: FlyOptions) -> None:
             lambda sentence: options.note(tidy(sentence)),
         )
     else:
-        rendered = (frames.render(index, display) for index in todo)
+        rendered = (frames.render(index) for index in todo)
     watch = click.get_current_context().find_object(Watch)
     assert watch, "as main hands it over"
     goes_on = "the same command goes on"
@@ -1186,21 +1186,17 @@ class _Display(_Bar):
 
 
 class _FramesDisplay(_Bar):
-    """Tells how many frames of a flight are done, ``done`` of them from the start; called with each
-    ``stills.Progress`` of the frame in work."""
+    """Tells how many frames of a flight are done, ``done`` of them from the start."""
 
-    def __init__(self, count: int, done: int, quiet: bool):
+    def __init__(self, frames: Frames, done: int, quiet: bool):
         super().__init__(quiet, lines=False)
-        self.count, self.kept, self.done = count, done, done
-        self.start = time.perf_counter()
-        self.progress: stills.Progress | None = None
-
-    def __call__(self, progress: stills.Progress) -> None:
-        self.progress = progress
+        self.frames, self.count = frames, frames.plan.count
+        self.kept = self.done = done
+        self.start = self.start_of_frame = time.perf_counter()
 
     def frame_is_done(self) -> None:
         self.done += 1
-        self.progress = None
+        self.start_of_frame = time.perf_counter()
 
     def aside(self) -> contextlib.AbstractContextManager:
         """A context in which lines can be printed, without the bar in their way."""
@@ -1208,18 +1204,18 @@ class _FramesDisplay(_Bar):
 
     def finishing(self) -> str:
         """What is said when the frame in work is waited for."""
-        about = ""
-        if self.progress and self.progress.left is not None:
-            about = f", in about {self.progress.left:.0f} s"
+        left = self.frames.left
+        about = "" if left is None else f", in about {left:.0f} s"
         return (
             f"finishing the frame that is being rendered{about}; a second signal ends this at once."
         )
 
     def _state(self) -> tuple[float, str]:
-        seconds = time.perf_counter() - self.start
-        progress, done = self.progress, float(self.done - self.kept)
-        if progress and progress.samples and progress.left is not None:
-            done += progress.seconds / max(progress.seconds + progress.left, 1e-9)
+        now = time.perf_counter()
+        left, since, seconds = self.frames.left, now - self.start_of_frame, now - self.start
+        done = float(self.done - self.kept)
+        if left is not None:
+            done += since / max(since + left, 1e-9)
         words = [f"{self.done}/{self.count} frames"]
         if done:
             words.append(f"{self._clock((self.count - self.kept - done) * seconds / done)} left")

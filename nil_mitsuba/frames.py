@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +44,8 @@ class Frames:
 
     def __init__(self, opened: Opened, plan: Plan):
         self.opened, self.plan = opened, plan
+        self.in_work: Still | None = None
+        self.progress: Progress | None = None  # of that
         self.chart = Chart.of(opened.nil)
         sensor = opened.scene.sensors()[opened.job.sensor]
         self.sensor = mi.traverse(sensor)
@@ -92,12 +93,13 @@ class Frames:
         finally:
             mi.set_log_level(level)
 
-    def render(self, index: int, progress: Callable[[Progress], None] | None = None) -> Checkpoint:
+    def render(self, index: int) -> Checkpoint:
         """A frame's sums; ``about`` says which it is, where the sensor stood and what it was set
         to."""
-        still = self.still(index)
+        still = self.in_work = self.still(index)
         passes = map(still.render, still.todo(still.nothing(), stop=still.count))
-        state, _ = still.accumulate(still.nothing(), passes, progress, interruptible=False)
+        state, _ = still.accumulate(still.nothing(), passes, self._follow, interruptible=False)
+        self.in_work = self.progress = None
         pose, parameters = self.flight.at(index)
         matrix = pose.to_world(self.chart).matrix
         state.about = {
@@ -107,6 +109,17 @@ class Frames:
             **parameters,
         }
         return state
+
+    @property
+    def left(self) -> float | None:
+        """Estimated seconds until the frame that is being rendered is done; None if unknown."""
+        progress, still = self.progress, self.in_work  # another thread may ask
+        if progress and progress.left is not None:
+            return progress.left
+        return still.passes.left if still and still.count == 1 else None
+
+    def _follow(self, progress: Progress) -> None:
+        self.progress = progress
 
     def _move(self, pose: Pose, parameters: dict[str, float]) -> None:
         self.sensor["to_world"] = mi.Transform4f(pose.to_world(self.chart))

@@ -154,9 +154,9 @@ def test_frames_that_are_there_are_kept(command, film, monkeypatch, form):
     (film / "film" / f"0002.{form}").unlink()
     rendered, render = [], frames.Frames.render
 
-    def counted(self, index, *more):
+    def counted(self, index):
         rendered.append(index)
-        return render(self, index, *more)
+        return render(self, index)
 
     monkeypatch.setattr(frames.Frames, "render", counted)
     status, out, err = command(*fly)
@@ -282,7 +282,9 @@ def test_a_terminal_gets_a_bar_of_frames(command, film, monkeypatch):
     monkeypatch.setattr(cli._FramesDisplay, "BAR_SECONDS", 0.001)
     assert command(*FLY, "--frames", "3")[0] == 0, terminal.getvalue()
     text = terminal.getvalue()
-    assert "2/3 frames, 00:00 left, 00:00 elapsed" in text and " 67% |" in text
+    assert re.search(r"2/3 frames, \d\d:\d\d left, \d\d:\d\d elapsed", text)
+    parts = list(map(int, re.findall(r"(\d+)% \|", text)))
+    assert parts[0] == 0 and any(67 <= part < 100 for part in parts)
 
 
 def test_quiet_means_nothing_but_errors(command, film):
