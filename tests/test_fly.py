@@ -141,6 +141,9 @@ def test_frames_are_denoised_and_have_layers(command, film):
     channels = planes("film/0000.exr")
     assert set(channels) == {*"RGB", *(f"noisy.{c}" for c in "RGB"), "depth.Z"}
     assert channels["R"] != channels["noisy.R"]
+    # The denoiser has its albedo rendered in any case
+    err = command(*FLY, "--frames", "1", "--denoise", "--layers", "distance,albedo")[2]
+    assert "layers is distance there and distance,albedo here" in err
 
 
 # -------------------------------------------------------------------- what is kept
