@@ -25,9 +25,13 @@ OTHER_NUMBERS = b"nil-mitsuba sums 1\n"
 ALIGNMENT = 64  # bytes; arrays are read where they lie
 ARRAYS = {"values": "d", "moments": "d", "points": "i"}  # fields of Sums and their item types
 
-# What settings are called in sentences, where their own names would not do.
+# Settings whose values would be of no use to anyone: hashes, or many numbers.
+CHANGED = {
+    "scene": "the scene or a file that it names has changed",
+    "keys": "the keys have changed",
+}
+# What others are called in sentences, where their own names would not do.
 NAMES = {
-    "scene": "the scene or a file that it names",  # its value is a hash, of no use to anyone
     "pass_spp": "samples per pixel in a pass",
     "channels": "the film's channels",
 }
@@ -62,7 +66,7 @@ class Checkpoint:
 
     def require(self, settings: dict) -> None:
         """Raise ValueError, with one sentence, unless the settings are these."""
-        found = list(_differences(self.settings, settings))
+        found = list(differences(self.settings, settings))
         if found:
             raise ValueError("; ".join(found) + ".")
 
@@ -180,18 +184,15 @@ def _header(data: bytes, name: str) -> tuple[dict, int]:
     raise ValueError(f"{name} is damaged: its checksum is wrong.")
 
 
-def _differences(ours: dict, theirs: dict) -> Iterator[str]:
+def differences(ours: dict, theirs: dict) -> Iterator[str]:
     """Sentences on what differs: "twist is 1 there and 2 here"."""
     for key in sorted(ours.keys() | theirs.keys(), key=list(ours | theirs).index):
         there, here = ours.get(key), theirs.get(key)
         if isinstance(there, dict) and isinstance(here, dict):
-            yield from _differences(there, here)
+            yield from differences(there, here)
         elif there != here:
             name = NAMES.get(key, key)
-            if key == "scene":
-                yield f"{name} has changed"
-            else:
-                yield f"{name} is {_word(there)} there and {_word(here)} here"
+            yield CHANGED.get(key, f"{name} is {_word(there)} there and {_word(here)} here")
 
 
 def _word(value) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import json
 import math
 import os
 import re
@@ -16,6 +17,7 @@ import tempfile
 import threading
 import time
 import webbrowser
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,10 +25,11 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, aiming, checkpoint, exr, jobs, png, stills
+from . import __version__, aiming, checkpoint, exr, jobs, keys, png, stills
 from .errors import cause_of
 from .fitting import FITS, cut_off
 from .fog import ALBEDO, MOST, Fog
+from .frames import Frames, Plan, is_there, path_of
 from .layers import GUIDES, RENDERED
 from .output import Output, metadata_of, software
 from .parameters import nearest
@@ -164,23 +167,24 @@ passes_option = functools.partial(click.option, cls=PassesOption)
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """How a picture is written: the options that ``render`` and ``merge`` share."""
+    """How a picture is written: the options that ``render``, ``merge`` and ``fly`` share."""
 
-    png: str | None
     exposure: float
     filmic: bool
     denoise: bool
     compression: str
 
-    def output_to(self, exr_path: Path, png_path: Path | None, layers: tuple[str, ...]) -> Output:
+    def output_to(
+        self, exr_path: Path | None, png_path: Path | None, layers: tuple[str, ...]
+    ) -> Output:
         return Output(
             exr_path, png_path, self.exposure, self.filmic, self.compression, self.denoise, layers
         )
 
 
 @dataclass(frozen=True)
-class RenderOptions(PictureOptions):
-    """The options of ``render``, and its argument, as click has checked them."""
+class SceneOptions(PictureOptions):
+    """What is rendered and by whom: the argument and options that ``render`` and ``fly`` share."""
 
     scene: str
     output: str | None
@@ -188,11 +192,7 @@ class RenderOptions(PictureOptions):
     spp: int | None
     seconds: float | None
     noise: float | None
-    pass_spp: int | None
     seed: int
-    checkpoint: str | None
-    resume: bool
-    passes: tuple[int, int] | None
     scheduler: str | None
     workers: int | None
     mode: str
@@ -220,12 +220,27 @@ class RenderOptions(PictureOptions):
     def clustered(self) -> bool:
         return bool(self.scheduler or self.workers)
 
-    def job(self, rules: stills.Rules, sums: Path) -> jobs.Job:
-        """The job that these options describe."""
+    def rules(self) -> stills.Rules:
+        """When a picture is done; looks, too, whether all is there that the options need."""
+        try:
+            rules = stills.check_rules(self.spp, self.seconds, self.noise)
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
+        if self.clustered:
+            if self.scheduler and self.workers:
+                raise click.UsageError(
+                    "--workers starts a cluster here, --scheduler names another."
+                )
+            from . import cluster  # noqa: F401 - says what it needs before anything is rendered
+        if self.denoise:
+            _require_denoiser()
+        return rules
+
+    def job(self, **more) -> jobs.Job:
+        """The job that these options describe, and ``more``."""
         properties = dict(self.properties)
         if self.layers is not None:
             properties["aovs"] = self.layers
-        pass_spp = self.pass_spp or stills.pass_spp_of(sums, self.resume)
         return jobs.Job(
             self.scene,
             self.mode,
@@ -233,12 +248,42 @@ class RenderOptions(PictureOptions):
             properties,
             self.sensor,
             self.seed,
-            rules.spp,
-            pass_spp,
             denoise=self.denoise,
             fit=self.fit,
             fog=_fog(self.fog, self.fog_albedo),
+            **more,
         )
+
+    def open(self, job: jobs.Job) -> tuple[jobs.Opened, dict]:
+        """A job's scene, loaded, and what the metadata of its pictures tell of it."""
+        _set_variant(self.mode, self.verbose, self.quiet)
+        dr.set_thread_count(self.threads or dr.thread_count())
+        opened = jobs.open_scene(job, self.note)
+        return opened, {
+            "scene": self.scene,
+            "integrator": str(opened.integrator),
+            "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
+        }
+
+
+@dataclass(frozen=True)
+class RenderOptions(SceneOptions):
+    """The options of ``render``, and its argument, as click has checked them."""
+
+    png: str | None
+    pass_spp: int | None
+    checkpoint: str | None
+    resume: bool
+    passes: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class FlyOptions(SceneOptions):
+    """The options of ``fly``, and its argument, as click has checked them."""
+
+    keys: str
+    frames: int
+    format: str
 
 
 @dataclass(frozen=True)
@@ -264,11 +309,13 @@ def cli():
     """Render Mitsuba scenes in Nil geometry."""
 
 
+png_option = click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too.")
+
+
 def picture_options(command):
     """The options on how a picture is written."""
     for option in reversed(
         (
-            click.option("--png", metavar="OUT.png", help="Write an sRGB picture, too."),
             click.option(
                 "--exposure",
                 type=Range(-png.MAX_EXPOSURE, png.MAX_EXPOSURE),
@@ -290,6 +337,59 @@ def picture_options(command):
                 default="zip",
                 show_default=True,
                 help="Of the EXR file; dwaa and dwab are lossy.",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def sample_options(command):
+    """The options on what is rendered, until when."""
+    for option in reversed(
+        (
+            passes_option(
+                "--layers",
+                metavar="A,B,…",
+                help=f"Layers beside the picture: {', '.join(RENDERED)}.",
+            ),
+            click.option(
+                "--spp",
+                type=click.IntRange(1),
+                help="Samples per pixel.  [default: the scene's, or with --time or --noise no "
+                "limit]",
+            ),
+            passes_option(
+                "--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m."
+            ),
+            passes_option(
+                "--noise",
+                type=Range(0, min_open=True),
+                metavar="ERROR",
+                help="Stop at this relative error, such as 0.02; pixels that are infinite or not "
+                "a number are left out.",
+            ),
+            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def process_options(command):
+    """The options on who renders, and what is said meanwhile."""
+    for option in reversed(
+        (
+            passes_option(
+                "--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render."
+            ),
+            passes_option("--workers", type=click.IntRange(1), help="Render in so many processes."),
+            click.option(
+                "-t", "--threads", type=click.IntRange(1), help="Threads of each process."
+            ),
+            click.option("-q", "--quiet", is_flag=True, help="Print errors only."),
+            click.option(
+                "-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks)."
             ),
         )
     ):
@@ -362,23 +462,9 @@ def scene_options(command):
 @click.option(
     "-o", "--output", metavar="OUT.exr", help="Default: beside the scene, named after it."
 )
+@png_option
 @picture_options
-@passes_option(
-    "--layers", metavar="A,B,…", help=f"Layers beside the picture: {', '.join(RENDERED)}."
-)
-@click.option(
-    "--spp",
-    type=click.IntRange(1),
-    help="Samples per pixel.  [default: the scene's, or with --time or --noise no limit]",
-)
-@passes_option("--time", "seconds", type=Duration(), help="Stop after such a time as 90s or 1h30m.")
-@passes_option(
-    "--noise",
-    type=Range(0, min_open=True),
-    metavar="ERROR",
-    help="Stop at this relative error, such as 0.02; pixels that are infinite or not a "
-    "number are left out.",
-)
+@sample_options
 @passes_option(
     "--pass-spp",
     type=click.IntRange(1),
@@ -386,7 +472,6 @@ def scene_options(command):
     "and --spp, as a file tells them, render its picture again.  [default: by size and "
     "rules]",
 )
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
 @passes_option(
     "--checkpoint",
     metavar="FILE" + SUMS,
@@ -399,12 +484,8 @@ def scene_options(command):
     type=PassRange(),
     help='Render these passes only, into a file for "nil-mitsuba merge".',
 )
-@passes_option("--scheduler", metavar="tcp://HOST:PORT", help="Let a Dask cluster render.")
-@passes_option("--workers", type=click.IntRange(1), help="Render in so many processes.")
+@process_options
 @scene_options
-@click.option("-t", "--threads", type=click.IntRange(1), help="Threads of each process.")
-@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-@click.option("-v", "--verbose", count=True, help="Be more verbose (repeat for tracebacks).")
 def render(**options):
     """Render a scene with the integrator "nil", whatever integrator it names.
 
@@ -523,6 +604,41 @@ def _viewfinder(job: jobs.Job, link):
     return Viewfinder(opened, notes, link)
 
 
+@cli.command(cls=FittingCommand)
+@click.argument("scene", metavar="SCENE.xml")
+@click.option(
+    "--keys",
+    required=True,
+    metavar="CAMERAS.json",
+    help="The cameras by which the flight leads.",
+)
+@click.option("--frames", required=True, type=click.IntRange(1), help="How many.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FOLDER",
+    help="Where to write them, by their numbers.  [default: beside the scene, named after it]",
+)
+@click.option(
+    "--format",
+    type=click.Choice(["exr", "png"]),
+    default="exr",
+    show_default=True,
+    help="Of the frames: EXR, or sRGB.",
+)
+@picture_options
+@sample_options
+@process_options
+@scene_options
+def fly(**options):
+    """Render the frames of a flight, along geodesics from camera to camera.
+
+    Frames that are there are kept, so that the same command goes on where one has ended. Ctrl-C and
+    SIGTERM finish the frame that is being rendered. --spp, --time and --noise are those of a frame.
+    """
+    _fly(FlyOptions(**options))
+
+
 @cli.command()
 @click.argument("parts", metavar="PARTS...", nargs=-1, required=True)
 @click.option(
@@ -532,15 +648,16 @@ def _viewfinder(job: jobs.Job, link):
     required=True,
     help=f"With the suffix {SUMS}, the parts in one file.",
 )
+@png_option
 @picture_options
-def merge(parts, output, **picture):
+def merge(parts, output, png, **picture):
     """Join parts that "nil-mitsuba render --passes" has rendered, to a picture."""
     options = PictureOptions(**picture)
     sums_only = Path(output).suffix == SUMS
-    if sums_only and (options.png or options.denoise):
+    if sums_only and (png or options.denoise):
         raise click.UsageError(f"--png and --denoise go with a picture, not with {SUMS}.")
     exr_path = _output_path(output, SUMS if sums_only else ".exr", "-o")
-    png_path = _output_path(options.png, ".png", "--png") if options.png else None
+    png_path = _output_path(png, ".png", "--png") if png else None
     if sums_only and exr_path.exists() and not any(map(exr_path.samefile, parts)):
         raise click.ClickException(
             f'"{exr_path}" holds samples and is none of the parts: remove it, or name another file.'
@@ -639,29 +756,12 @@ def tidy(text: str) -> str:
 def _render(options: RenderOptions) -> None:
     scene = _scene_path(options.scene)
     paths = _paths(scene, options)
-    try:
-        rules = stills.check_rules(options.spp, options.seconds, options.noise)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    if options.clustered:
-        if options.scheduler and options.workers:
-            raise click.UsageError("--workers starts a cluster here, --scheduler names another.")
-        from . import cluster  # noqa: F401 - says what it needs before anything is rendered
-    if options.denoise:
-        _require_denoiser()
-
-    note = options.note
-    _set_variant(options.mode, options.verbose, options.quiet)
-    dr.set_thread_count(options.threads or dr.thread_count())
-    opened = jobs.open_scene(options.job(rules, paths.sums), note)
-    about = {
-        "scene": options.scene,
-        "integrator": str(opened.integrator),
-        "commandLine": shlex.join(["nil-mitsuba", *sys.argv[1:]]),
-    }
+    rules = options.rules()
+    pass_spp = options.pass_spp or stills.pass_spp_of(paths.sums, options.resume)
+    opened, about = options.open(options.job(spp=rules.spp, pass_spp=pass_spp))
     if hasattr(opened.integrator, "view"):
         if options.resume and not paths.sums.exists():
-            note(f'there is no checkpoint "{paths.sums}": beginning with the first pass.')
+            options.note(f'there is no checkpoint "{paths.sums}": beginning with the first pass.')
         still = _still(opened, rules, options)
         _render_still(still, opened, about, paths, options)
     else:
@@ -674,9 +774,7 @@ def _still(opened: jobs.Opened, rules: stills.Rules, options: RenderOptions) -> 
     if options.denoise:
         _require_guides(still.settings)
     if options.png and not still.settings["film"]["pixel_format"]:
-        raise click.ClickException(
-            f'--png needs a film with colours, and "{still.settings["film"]["type"]}" has none.'
-        )
+        raise click.ClickException(_no_colours("--png", still.settings))
     if options.passes:
         stills.film_of(still.settings["film"])  # what "merge" will need
         first, stop = options.passes
@@ -810,6 +908,136 @@ def _render_in_one_go(
         options.tell(path)
 
 
+# ----------------------------------------------------------------------- flights
+
+
+def _fly(options: FlyOptions) -> None:
+    scene = _scene_path(options.scene)
+    folder = _folder(options.output or scene.with_suffix(""))
+    _refuse_of_another_format(options)
+    rules = options.rules()
+    plan = Plan(tuple(keys.load(options.keys)), options.frames, rules)
+    if len(plan.keys) < 2:
+        count = "one key" if plan.keys else "no keys"
+        raise click.ClickException(
+            f'"{options.keys}" has {count}, and a flight leads from one to another: give two or '
+            "more."
+        )
+    opened, about = options.open(options.job(flight=plan))
+    try:
+        frames = Frames(opened, plan)
+    except keys.UnfitError as error:
+        raise click.ClickException(f'"{options.keys}", {tidy(str(error))}') from None
+    settings = frames.settings
+    if options.denoise:
+        _require_guides(settings)
+    png_only = options.format == "png"
+    if png_only and not settings["film"]["pixel_format"]:
+        raise click.ClickException(_no_colours("--format png", settings))
+    # How it is written is part of what a frame is
+    settings |= {"layers": list(opened.layers), "denoise": options.denoise} | (
+        {"exposure": options.exposure, "filmic": options.filmic}
+        if png_only
+        else {"compression": options.compression}
+    )
+
+    paths = [
+        path_of(folder, index, plan.count, f".{options.format}") for index in range(plan.count)
+    ]
+    todo = [i for i, path in enumerate(paths) if not is_there(path, settings | {"frame": i})]
+    kept = plan.count - len(todo)
+    if kept:
+        options.note(f"kept {_count(kept)}.")
+    if not todo:
+        return
+    _make(folder)
+    flight = frames.flight
+    options.note(
+        f"{'a loop' if flight.loop else 'a flight'} of {flight.length:.3g} cells"
+        + (": behind its last frame comes its first." if flight.loop else ".")
+    )
+    rendered: Iterator[checkpoint.Checkpoint | None]
+    display = _FramesDisplay(frames, kept, options.quiet)
+    if options.clustered:
+        from . import cluster
+
+        job = replace(
+            opened.job, path=os.path.abspath(options.scene), pass_spp=settings["pass_spp"]
+        )
+        rendered = cluster.render_frames(
+            job,
+            todo,
+            options.scheduler,
+            options.workers or 1,
+            options.threads,
+            lambda sentence: options.note(tidy(sentence)),
+        )
+    else:
+        rendered = (frames.render(index) for index in todo)
+    watch = click.get_current_context().find_object(Watch)
+    assert watch, "as main hands it over"
+    goes_on = "the same command goes on"
+    watch.farewell = lambda: f"interrupted at {_count(display.done)} of {plan.count}; {goes_on}."
+    noisiest = -1.0, ""
+    with contextlib.ExitStack() as stack:
+        if not (options.clustered or options.quiet):  # a cluster is not waited for
+            stack.enter_context(watch.explaining(display.finishing))
+        signals = stack.enter_context(stills.interruption())
+        stack.enter_context(contextlib.closing(rendered))
+        stack.enter_context(display)
+        for state in rendered:
+            if state is not None:
+                index = state.about["frame"]
+                mark = json.dumps(settings | {"frame": index})
+                state.about = about | state.about | {"flight": mark}
+                exr_path, png_path = (None, paths[index]) if png_only else (paths[index], None)
+                out = options.output_to(exr_path, png_path, opened.layers)
+                out.write(stills.picture_of(state, frames.film), metadata_of(state))
+                display.frame_is_done()
+                with display.aside():
+                    options.tell(paths[index])
+                noisiest = max(noisiest, (state.noise or 0.0, _how_far(state, options.denoise)))
+            if signals:
+                break
+    if display.done == plan.count:
+        options.note(f"{_count(len(todo))}; the noisiest: {noisiest[1]}.")
+    else:
+        raise Stopped(watch.farewell(), signals[0])
+
+
+def _refuse_of_another_format(options: FlyOptions) -> None:
+    """Refuse options that would do nothing."""
+    of_exr = {"--layers": options.layers, "--compression": options.compression != "zip"}
+    of_png = {"--exposure": options.exposure, "--filmic": options.filmic}
+    wrong, right = (of_exr, "exr") if options.format == "png" else (of_png, "png")
+    for name, given in wrong.items():
+        if given:
+            raise click.UsageError(f"{name} goes with --format {right}.")
+
+
+def _folder(name: str | Path) -> Path:
+    """A folder that is there and can be written to, or can be made."""
+    folder = Path(name)
+    if os.path.lexists(folder):
+        if not folder.is_dir():
+            raise click.ClickException(f'cannot write to "{folder}": it is not a folder.')
+        _require_writable(folder)
+    return folder
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise click.ClickException(
+            f'cannot make the folder "{folder}": {error.strerror}.'
+        ) from None
+
+
+def _count(frames: int) -> str:
+    return f"{frames} frame{'' if frames == 1 else 's'}"
+
+
 def _finishing(still: stills.Still) -> str:
     left, about = still.passes.left, ""
     if left is not None:
@@ -845,22 +1073,20 @@ def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
     return f"{_how_far(state, denoised)}{advice}."
 
 
-class _Display:
-    """Tells on stderr how far a still is: a bar on a terminal, elsewhere a line now and then.
+class _Bar:
+    """Tells on stderr how far something is: a bar on a terminal; elsewhere, if it has ``lines``, a
+    line now and then.
 
-    Called with each ``stills.Progress``; passes may take minutes, and a thread tells the time
-    meanwhile.
+    A thread tells the time, whatever goes on.
     """
 
     FORM = "{percentage:3.0f}% |{bar}| {desc}"  # tqdm puts a comma before "postfix"
     BAR_SECONDS, LINE_SECONDS = 1.0, 10.0
 
-    def __init__(self, still: stills.Still, quiet: bool):
+    def __init__(self, quiet: bool, lines: bool):
         from tqdm import tqdm
 
-        self.still = still
         self.quiet = quiet or sys.stderr is None  # closed from the start
-        self.pixels = float(dr.prod(still.film.crop_size()))
         self.bar = tqdm(
             total=1.0,
             bar_format=self.FORM,
@@ -868,8 +1094,8 @@ class _Display:
             leave=False,
             dynamic_ncols=True,
         )
-        self.latest: tuple[stills.Progress, float] | None = None  # and when it came
-        self.done = threading.Event()
+        self.quiet = self.quiet or bool(self.bar.disable and not lines)
+        self.over = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self):
@@ -878,33 +1104,58 @@ class _Display:
         return self
 
     def __exit__(self, *_):
-        self.done.set()
+        self.over.set()
         if not self.quiet:
             self.thread.join()
         self.bar.close()
 
-    def __call__(self, progress: stills.Progress) -> None:
-        self.latest = progress, time.perf_counter()
-        if not self.bar.disable:
-            self._show(*self.latest)
-
     def _run(self) -> None:
-        while not self.done.wait(self.LINE_SECONDS if self.bar.disable else self.BAR_SECONDS):
-            if self.latest is not None:
-                self._show(*self.latest)
+        while not self.over.wait(self.LINE_SECONDS if self.bar.disable else self.BAR_SECONDS):
+            self._show()
 
-    def _show(self, progress: stills.Progress, then: float) -> None:
-        since = time.perf_counter() - then
-        left = self._left(progress, since)
-        seconds = progress.seconds + since
-        text = self._words(progress, seconds, left)
+    def _show(self) -> None:
+        part, text = self._state()
+        if not text:
+            return
         if self.bar.disable:
             _note(text)
             return
-        whole = seconds + left if left is not None else 0
-        self.bar.n = min(1.0, seconds / whole) if whole else 0.0
+        self.bar.n = min(1.0, part)
         with contextlib.suppress(OSError):  # as in _note
             self.bar.set_description_str(text, refresh=True)
+
+    def _state(self) -> tuple[float, str]:
+        """The part that is done, and words; none before there is something to say."""
+        raise NotImplementedError
+
+    def _clock(self, seconds: float) -> str:
+        # Beyond thirty years no one waits, and the estimate means nothing
+        return self.bar.format_interval(seconds) if seconds < 1e9 else "?"
+
+
+class _Display(_Bar):
+    """Tells how far a still is; called with each ``stills.Progress``."""
+
+    def __init__(self, still: stills.Still, quiet: bool):
+        super().__init__(quiet, lines=True)
+        self.still = still
+        self.pixels = float(dr.prod(still.film.crop_size()))
+        self.latest: tuple[stills.Progress, float] | None = None  # and when it came
+
+    def __call__(self, progress: stills.Progress) -> None:
+        self.latest = progress, time.perf_counter()
+        if not self.bar.disable:
+            self._show()
+
+    def _state(self) -> tuple[float, str]:
+        if self.latest is None:
+            return 0.0, ""
+        progress, then = self.latest
+        since = time.perf_counter() - then
+        left = self._left(progress, since)
+        seconds = progress.seconds + since
+        whole = seconds + left if left is not None else 0
+        return seconds / whole if whole else 0.0, self._words(progress, seconds, left)
 
     def _left(self, progress: stills.Progress, since: float) -> float | None:
         """Seconds that are left, so long after the passes that are done."""
@@ -933,9 +1184,43 @@ class _Display:
             words.append(f"{rate / 1e6:.2f} M/s")
         return ", ".join(words)
 
-    def _clock(self, seconds: float) -> str:
-        # Beyond thirty years no one waits, and the estimate means nothing
-        return self.bar.format_interval(seconds) if seconds < 1e9 else "?"
+
+class _FramesDisplay(_Bar):
+    """Tells how many frames of a flight are done, ``done`` of them from the start."""
+
+    def __init__(self, frames: Frames, done: int, quiet: bool):
+        super().__init__(quiet, lines=False)
+        self.frames, self.count = frames, frames.plan.count
+        self.kept = self.done = done
+        self.start = self.start_of_frame = time.perf_counter()
+
+    def frame_is_done(self) -> None:
+        self.done += 1
+        self.start_of_frame = time.perf_counter()
+
+    def aside(self) -> contextlib.AbstractContextManager:
+        """A context in which lines can be printed, without the bar in their way."""
+        return self.bar.external_write_mode()
+
+    def finishing(self) -> str:
+        """What is said when the frame in work is waited for."""
+        left = self.frames.left
+        about = "" if left is None else f", in about {left:.0f} s"
+        return (
+            f"finishing the frame that is being rendered{about}; a second signal ends this at once."
+        )
+
+    def _state(self) -> tuple[float, str]:
+        now = time.perf_counter()
+        left, since, seconds = self.frames.left, now - self.start_of_frame, now - self.start
+        done = float(self.done - self.kept)
+        if left is not None:
+            done += since / max(since + left, 1e-9)
+        words = [f"{self.done}/{self.count} frames"]
+        if done:
+            words.append(f"{self._clock((self.count - self.kept - done) * seconds / done)} left")
+        words.append(f"{self._clock(seconds)} elapsed")
+        return (self.kept + done) / self.count, ", ".join(words)
 
 
 # ----------------------------------------------------------------------- output
@@ -995,6 +1280,10 @@ def _require_guides(settings: dict) -> None:
         )
 
 
+def _no_colours(option: str, settings: dict) -> str:
+    return f'{option} needs a film with colours, and "{settings["film"]["type"]}" has none.'
+
+
 def _output_path(name: str | Path, suffix: str, option: str) -> Path:
     """Path of a file that can be written, whose suffix says what it holds."""
     path = Path(name)
@@ -1017,14 +1306,18 @@ def _output_path(name: str | Path, suffix: str, option: str) -> Path:
                 raise click.ClickException(f'cannot write "{path}": it is {what}.')
     except OSError as error:  # such as a name that is too long
         raise click.ClickException(f'cannot write "{path}": {error.strerror}.') from None
+    _require_writable(real.parent, path.parent)
+    return path
+
+
+def _require_writable(folder: Path, name: Path | None = None) -> None:
     try:
-        with tempfile.TemporaryFile(dir=real.parent):
+        with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise click.ClickException(
-            f'cannot write to the folder "{path.parent}": {error.strerror}.'
+            f'cannot write to the folder "{name or folder}": {error.strerror}.'
         ) from None
-    return path
 
 
 def _tell(path: Path) -> None:

@@ -1,4 +1,5 @@
-"""The passes of a still on many machines: handed to a Dask cluster and taken back as they come."""
+"""Passes of a still, or frames, on many machines: handed to a Dask cluster and taken back as they
+come."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import platform
 import signal
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
@@ -77,23 +78,58 @@ def render(
     no such cluster (any more), or if passes end every worker that takes them, and ValueError if no
     worker can render them.
     """
+    left = None if still.count is None else len(indices := list(indices))
+    queue = Queue(indices, left)
+    with _parts(job, queue, scheduler, workers, threads, complain) as parts:
+        for data in parts:
+            yield still.nothing() if data is None else Checkpoint.from_bytes(data, "a part")
+
+
+def render_frames(
+    job: Job,
+    indices: list[int],
+    scheduler: str | None = None,
+    workers: int = 1,
+    threads: int | None = None,
+    complain: Callable[[str], None] = print,
+) -> Generator[Checkpoint | None, None, None]:
+    """Frames of the flight of a job, each rendered by one worker; otherwise as ``render``.
+
+    Yields None every few seconds without a frame.
+    """
+    queue = Queue(indices, len(indices), most=1)
+    with _parts(job, queue, scheduler, workers, threads, complain) as parts:
+        for data in parts:
+            yield None if data is None else Checkpoint.from_bytes(data, "a frame")
+
+
+@contextlib.contextmanager
+def _parts(
+    job: Job,
+    queue: Queue,
+    scheduler: str | None,
+    workers: int,
+    threads: int | None,
+    complain: Callable[[str], None],
+) -> Iterator[Iterator[bytes | None]]:
     if scheduler is None and threads is None:
         threads = max(1, dr.thread_count() // workers)
-    left = None if still.count is None else len(indices := list(indices))
     with _connected(scheduler, workers) as client:
-        parts = Hands(client, job, Queue(indices, left), threads, complain).parts()
-        with contextlib.closing(parts):
-            for data in parts:
-                yield still.nothing() if data is None else Checkpoint.from_bytes(data, "a part")
+        with contextlib.closing(Hands(client, job, queue, threads, complain).parts()) as parts:
+            yield parts
 
 
 class Queue:
-    """Passes that are to be handed out, in ranges; ``left`` of them, None if there is no end."""
+    """Passes that are to be handed out, in ranges; ``left`` of them, None if there is no end.
 
-    def __init__(self, indices: Iterable[int], left: int | None):
+    Frames, too, which come one by one: there are ``most`` in a range.
+    """
+
+    def __init__(self, indices: Iterable[int], left: int | None, most: int | None = None):
         self.indices = iter(indices)
         self.next = next(self.indices, None)
         self.left = left
+        self.most = most
         self.again: list[tuple[int, int]] = []
 
     def __bool__(self) -> bool:
@@ -121,7 +157,7 @@ class Queue:
         size = 1 if seconds is None else max(1, int(PART_SECONDS / max(seconds, 1e-3)))
         if self.left is not None:
             size = min(size, max(1, self.left // (PARTS_AHEAD * workers)))
-        return size
+        return min(size, self.most or size)
 
 
 class Hands:
@@ -156,9 +192,10 @@ class Hands:
                     if data is not None:
                         yield data
         except (distributed.CancelledError, CommClosedError):
+            resume = "" if self.job.flight else " with --resume"
             raise OSError(
-                "the connection to the cluster's scheduler is lost: the same command with "
-                "--resume goes on."
+                "the connection to the cluster's scheduler is lost: the same command"
+                f"{resume} goes on."
             ) from None
         finally:
             with contextlib.suppress(Exception):  # There may be no scheduler any more
@@ -232,7 +269,7 @@ class Hands:
         except distributed.TimeoutError:
             return None  # It stays where it is
         except distributed.KilledWorker as error:
-            raise OSError(_killing(part, error.last_worker.address)) from None
+            raise OSError(self._killing(part, error.last_worker.address)) from None
         else:
             self.seconds = seconds / (part[1] - part[0])
         del self.flying[future]
@@ -247,8 +284,16 @@ class Hands:
     def _lost(self, part: tuple[int, int]) -> None:
         self.losses[part] = self.losses.get(part, 0) + 1
         if self.losses[part] > LOSSES:
-            raise OSError(_killing(part))
+            raise OSError(self._killing(part))
         self.queue.again.append(part)
+
+    def _killing(self, part: tuple[int, int], address: str | None = None) -> str:
+        last = f", the last of them {address}" if address else ""
+        what = f"frame {part[0]}" if self.job.flight else f"passes {name_passes([part])}"
+        return (
+            f"every worker that took the {what} ended{last}: its log may say why; too little "
+            "memory is a common reason."
+        )
 
 
 # -------------------------------------------------------------------- on workers
@@ -292,14 +337,6 @@ def difference(theirs: dict[str, str], ours: dict[str, str]) -> str:
         f"it has {name} {theirs.get(name, 'of no version')}, and here is {version}"
         for name, version in ours.items()
         if theirs.get(name) != version
-    )
-
-
-def _killing(part: tuple[int, int], address: str | None = None) -> str:
-    last = f", the last of them {address}" if address else ""
-    return (
-        f"every worker that took the passes {name_passes([part])} ended{last}: its log may say "
-        "why; too little memory is a common reason."
     )
 
 

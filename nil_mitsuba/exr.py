@@ -304,8 +304,8 @@ def _text(attribute: exr_header.Attribute) -> str:
     if isinstance(value, bytes):
         return f"({kind}, {len(value)} bytes)"
     if isinstance(value, float) and kind == "float":  # as few digits as tell it from others
-        digits = (f"{value:.{n}g}" for n in range(1, 10))
-        return next((d for d in digits if _to_float32(float(d)) == value), str(value))
+        digits = (float(f"{value:.{n}g}") for n in range(1, 10))
+        return next((f"{d:.9g}" for d in digits if _to_float32(d) == value), str(value))
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
     return str(value)

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from .fitting import fit, unfitted
 from .fog import Fog
+from .frames import Frames, Plan
 from .layers import GUIDES
 from .scene_files import SceneFiles
 from .stills import Rules, Still
@@ -33,6 +34,7 @@ class Job:
     whatever lies there. ``denoise`` asks for what denoising needs: a film with the filter "box" and
     the layers that guide it. ``fit`` names what the cell is fitted to, as in ``fitting.FITS``;
     None leaves it as it is. ``fog`` fills the space around the sensors, if it is not None.
+    ``flight`` asks for frames, in the place of passes.
     """
 
     path: str
@@ -47,6 +49,7 @@ class Job:
     denoise: bool = False
     fit: str | None = None
     fog: Fog | None = None
+    flight: Plan | None = None
 
 
 class Opened(NamedTuple):
@@ -163,13 +166,20 @@ def open_still(job: Job) -> Still:
 
 
 def render_part(job: Job, first: int, stop: int) -> bytes:
-    """Passes ``first`` to ``stop`` − 1 of a job, as the contents of a checkpoint file.
+    """Passes ``first`` to ``stop`` − 1 of a job, as the contents of a checkpoint file; of a
+    flight's job the frame ``first``.
 
     The scene of the last job stays loaded in this process.
     """
     if _opened.get("job") != job:
         _opened.clear()
-        _opened.update(still=open_still(job), job=job)
+        if job.flight:
+            _opened.update(frames=Frames(open_scene(job), job.flight))
+        else:
+            _opened.update(still=open_still(job))
+        _opened.update(job=job)
+    if job.flight:
+        return _opened["frames"].render(first).to_bytes()
     still = _opened["still"]
     state = still.nothing()
     for index in range(first, stop):

@@ -24,6 +24,10 @@ MOST_CELLS = 10**6  # so far along each axis; products of two such are exact in 
 SKEW = 1e-3
 
 
+class UnfitError(ValueError):
+    """A key that a scene cannot be seen from; the sentence begins with its number."""
+
+
 @dataclass(frozen=True)
 class Key:
     """A camera by which a flight leads.

@@ -12,16 +12,19 @@ from .layers import GUIDES
 from .stills import Picture
 from .sums import name_noise, name_passes
 
+# Of the metadata, what a PNG file tells, too: which frame of which flight it is.
+IN_PNG = ("flight",)
+
 
 @dataclass(frozen=True)
 class Output:
-    """Where a picture goes: ``exr`` and perhaps ``png`` (paths), and how it is written.
+    """Where a picture goes: ``exr``, ``png`` or both (paths), and how it is written.
 
     ``denoise`` removes noise, guided by the layers `GUIDES`; of the layers, those in ``layers`` are
     written.
     """
 
-    exr: Path
+    exr: Path | None = None
     png: Path | None = None
     exposure: float = 0.0
     filmic: bool = False
@@ -42,20 +45,22 @@ class Output:
                 albedo, normal = denoise.through_media(albedo, normal, passed)
             image = denoise.denoise(image, albedo, normal)
             layers["noisy"] = picture.image[:, :, :3]
-        exr.write(
-            self.exr,
-            (picture.names, image),
-            layers,
-            metadata,
-            component_format=picture.component_format,
-            compression=self.compression,
-        )
+        if self.exr:
+            exr.write(
+                self.exr,
+                (picture.names, image),
+                layers,
+                metadata,
+                component_format=picture.component_format,
+                compression=self.compression,
+            )
         if self.png:
             png.write(
                 self.png,
                 png.linear_rgb(picture.names, image),
                 exposure=self.exposure,
                 filmic=self.filmic,
+                texts={name: metadata[name] for name in IN_PNG if name in metadata},
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ from .files import replacing
 
 MAX_EXPOSURE = 100  # stops; float32 has 127 on either side
 
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
 WHITE = 255
 
 # Narkowicz' fit of ACES' curve for screens: x (a x + b) / (x (c x + d) + e).
@@ -38,22 +40,51 @@ def write(
     exposure: float = 0.0,
     filmic: bool = False,
     dither: bool = True,
+    texts: Mapping[str, str] | None = None,
 ) -> None:
     """Write an image as a PNG file with 8 bits in sRGB.
 
     `image` has the shape (height, width, channels): linear RGB with the primaries of sRGB, or one
     channel of luminance, and after them alpha, by which they are multiplied, if there is one more.
-    `exposure` is in stops. The other parameters are those of ``levels``. Raises ValueError for
-    another shape or exposure and OSError if the file cannot be written; a file that `path` named
-    before is then as it was.
+    `exposure` is in stops. `texts`, in ASCII, become the file's, by keyword: ``texts_of`` reads
+    them. The other parameters are those of ``levels``. Raises ValueError for another shape or
+    exposure and OSError if the file cannot be written; a file that `path` named before is then as
+    it was.
     """
     pixels = levels(image, exposure=exposure, filmic=filmic, dither=dither)
     formats = mi.Bitmap.PixelFormat
     pixel_format = (formats.Y, formats.YA, formats.RGB, formats.RGBA)[image.shape[2] - 1]
     stream = mi.MemoryStream()
-    mi.Bitmap(pixels, pixel_format).write(stream, mi.Bitmap.FileFormat.PNG)
+    bitmap = mi.Bitmap(pixels, pixel_format)
+    for keyword, text in (texts or {}).items():
+        bitmap.metadata()[keyword] = text
+    bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
     with replacing(path) as part, open(part, "wb") as file:
         file.write(stream.raw_buffer())
+
+
+def texts_of(path: str | os.PathLike) -> dict[str, str]:
+    """The texts in a PNG file, by keyword.
+
+    Raises OSError if it cannot be read and ValueError if it is no PNG file or not whole.
+    """
+    try:
+        with open(path, "rb") as file:
+            start = file.read(len(SIGNATURE))
+    except OSError as error:
+        raise OSError(f'cannot read "{path}": {error.strerror or error}.') from None
+    if start != SIGNATURE:
+        raise ValueError(f'"{path}" is not a PNG file.')
+    try:
+        metadata = mi.Bitmap(str(path)).metadata()
+    except RuntimeError:
+        raise ValueError(f'"{path}" is damaged.') from None
+    # Mitsuba writes texts in quotation marks, and reads these, too
+    return {
+        keyword: metadata[keyword].removeprefix('"').removesuffix('"')
+        for keyword in metadata.keys()
+        if isinstance(metadata[keyword], str)
+    }
 
 
 def levels(

@@ -113,8 +113,8 @@ class Pose:
         That is so far to the left, along `upright` and along the view. The camera turns with the
         geodesic's frame direction, about the fibres: whoever walks straight ahead looks ahead.
         """
-        left, view = _unit(self.left), _unit(self.view)
-        towards = _unit(to[0] * left + to[1] * self.upright + to[2] * view)
+        left, view = unit(self.left), unit(self.view)
+        towards = unit(to[0] * left + to[1] * self.upright + to[2] * view)
         place, _ = geometry.flow(self.place, towards, length, chart.twist)
         angle = chart.twist * towards.z * length
         left, up, view, upright = (
@@ -127,14 +127,14 @@ class Pose:
 
         Upwards and downwards it ends a degree before `upright`.
         """
-        mirrored = _dot(_cross(self.up, self.view), self.left) < 0
+        mirrored = dot(cross(self.up, self.view), self.left) < 0
         pose = self._rotated(self.upright, -aside if mirrored else aside)
-        view = _unit(pose.view)
-        side = _cross(pose.upright, view)
+        view = unit(pose.view)
+        side = cross(pose.upright, view)
         size = math.hypot(*side)
         if size < STEEPEST:
             return pose
-        height = math.atan2(_dot(pose.upright, view), size)
+        height = math.atan2(dot(pose.upright, view), size)
         most = math.acos(STEEPEST)
         above = max(-most, min(most, height + above)) - height
         return pose._rotated(-1 / size * side, above)
@@ -144,37 +144,42 @@ class Pose:
 
         Straight up or down it keeps its sides, as far as they are across the view.
         """
-        view = _unit(self.view)
+        view = unit(self.view)
         aside = math.atan2(
-            _dot(_cross(view, towards), self.upright),
-            _dot(view, towards) - _dot(view, self.upright) * _dot(towards, self.upright),
+            dot(cross(view, towards), self.upright),
+            dot(view, towards) - dot(view, self.upright) * dot(towards, self.upright),
         )
         pose = self._rotated(self.upright, aside)
         # The rest is a turn up or down, about the axis across both
-        view = _unit(pose.view)
-        axis = _cross(view, towards)
+        view = unit(pose.view)
+        axis = cross(view, towards)
         sine = math.hypot(*axis)
         if sine == 0:
             return pose
-        return pose._rotated(1 / sine * axis, math.atan2(sine, _dot(view, towards)))
+        return pose._rotated(1 / sine * axis, math.atan2(sine, dot(view, towards)))
 
     def _rotated(self, axis: Vector, angle: float) -> Pose:
-        """Rotated about a unit axis (Rodrigues' formula), but for `upright`."""
-        s, c = math.sin(angle), math.cos(angle)
-        left, up, view = (
-            c * v + s * _cross(axis, v) + (1 - c) * _dot(axis, v) * axis
-            for v in (self.left, self.up, self.view)
-        )
+        """Rotated about a unit axis, but for `upright`."""
+        left, up, view = (rotated(v, axis, angle) for v in (self.left, self.up, self.view))
         return replace(self, left=left, up=up, view=view)
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
+def rotated(v: Vector, axis: Vector, angle: float) -> Vector:
+    """``v`` rotated about a unit axis (Rodrigues' formula)."""
+    s, c = math.sin(angle), math.cos(angle)
+    return c * v + s * cross(axis, v) + (1 - c) * dot(axis, v) * axis
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
     return ds.Array3f64([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
 
 
-def _dot(a: Vector, b: Vector) -> float:
+def dot(a: Vector, b: Vector) -> float:
+    """The scalar product."""
     return sum(x * y for x, y in zip(a, b))
 
 
-def _unit(v: Vector) -> Vector:
+def unit(v: Vector) -> Vector:
+    """``v`` divided by its length."""
     return 1 / math.hypot(*v) * v

@@ -221,18 +221,22 @@ class Still:
         parts: Iterable[Checkpoint],
         progress: Callable[[Progress], None] | None = None,
         saver: Saver | None = None,
+        interruptible: bool = True,
     ) -> tuple[Checkpoint, int | None]:
         """Add parts until there are no more, a rule is met, or a signal comes.
 
         ``parts`` yields checkpoints of passes as they are rendered, by whomever. Returns the sums
         and the number of the signal. In the main thread Ctrl-C and SIGTERM wait for the pass that
-        is being rendered; a second one does not.
+        is being rendered; a second one does not. If not ``interruptible``, they are for the caller.
         """
         parts = iter(parts)
         before, start = state.seconds, time.perf_counter()
         if state.noise is None:
             state.noise = noise(self.film, state.sums)
-        with interruption() as signals:
+        catching: contextlib.AbstractContextManager[list[int]] = (
+            interruption() if interruptible else contextlib.nullcontext([])
+        )
+        with catching as signals:
             while True:
                 state.seconds = before + time.perf_counter() - start
                 report = Progress(

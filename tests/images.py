@@ -15,6 +15,7 @@ METADATA = {
     "seed": 2**32 - 1,
     "passes": "0:16",
     "renderTime": 12.345678901,
+    "x_fov": 80.0,
     "twist": 1,
     "tolerance": 0.25,
     "quotient": True,

@@ -241,6 +241,7 @@ def test_the_description_tells_size_layers_and_metadata(tmp_path):
         "seed 4294967295",
         "tolerance 0.25",
         "renderTime 12.345678901",
+        "x_fov 80",
         "quotient true",
     ):
         assert row.split() in words, row

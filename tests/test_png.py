@@ -95,6 +95,22 @@ def test_the_file_holds_the_levels(tmp_path, channels, pixel_format):
     assert equal(pixels, mi.TensorXf(png.levels(image, exposure=0.5, filmic=True)))
 
 
+def test_texts_in_a_file_are_read_as_they_were_written(tmp_path):
+    path = tmp_path / "a.png"
+    texts = {"flight": '{"key": [1.5, "a \\"word\\"", null], "x": ""}', "long": "abc " * 10_000}
+    png.write(path, random_image(3), texts=texts)
+    found = png.texts_of(path)
+    assert {name: found[name] for name in texts} == texts
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(ValueError, match='a.png" is damaged'):
+        png.texts_of(path)
+    path.write_bytes(b"\x76\x2f\x31\x01")
+    with pytest.raises(ValueError, match='a.png" is not a PNG file'):
+        png.texts_of(path)
+    with pytest.raises(OSError, match="cannot read .*none.png.*No such file"):
+        png.texts_of(tmp_path / "none.png")
+
+
 def test_bad_exposures_and_shapes_are_named():
     for exposure in (1e9, float("nan")):
         with pytest.raises(ValueError, match="between -100 and 100 stops"):

@@ -178,6 +178,11 @@ def run_small(desk, line):
         # Scenes of the project take their size as parameters; the README's own is small
         size = [] if "hello.xml" in words else ["-D", "resx=32", "-D", "resy=18"]
         return run(desk, [*command, *words, *size, "--spp", "2"])
+    elif program == "nil-mitsuba" and words[0] == "fly":
+        size = ["-D", "resx=32", "-D", "resy=18", "--spp", "2", "--frames", "2"]
+        return run(desk, [*command, *words, *size])
+    elif program == "ffmpeg":
+        return ""  # not everyone's
     elif program == "nil-mitsuba":
         return run(desk, [*command, *words])
     elif program == "python" and words[-1] in TESTED_BY:
