@@ -552,8 +552,7 @@ def aim(scene, at, image, origin, up, mode, define, sensor, properties, fit, fog
 @scene_options
 @click.option(
     "--port",
-    type=click.IntRange(0, 2**16 - 1),
-    default=0,
+    type=click.IntRange(1024, 2**16 - 1),
     help="Of the page.  [default: one that is free]",
 )
 @click.option("--browser/--no-browser", default=True, help="Open the page.  [default: browser]")
@@ -574,7 +573,7 @@ def view(
     job = jobs.Job(
         scene, mode, dict(define), dict(properties), sensor, fit=fit, fog=_fog(fog, fog_albedo)
     )
-    with server.serve(port) as link, stills.interruption() as signals:
+    with server.serve(port or 0) as link, stills.interruption() as signals:
         click.echo(link.url)
         if browser:
             webbrowser.open(link.url)

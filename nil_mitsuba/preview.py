@@ -193,7 +193,7 @@ class Preview:
         shape = si.shape[0] if si.instance[0] is None else si.instance[0]
         return Sight(
             direction,
-            name_of(shape),
+            shape.id() or name_of(shape),
             (int(cell.x[0]), int(cell.y[0]), int(cell.z[0])) if space.quotient else None,
             _numbers(si.p),
             distance[0],

@@ -43,6 +43,9 @@ DEEPEST = 64  # the end of the slider, which stands for no limit
 PIECE_SECONDS = 0.1
 FIRST_PIECE, LEAST_PIECE = 2**15, 2**12
 
+# The denoiser's better network takes three times as long: it has to be worth it.
+FEW_PASSES = 16
+
 # A picture that refines is shown whenever it has twice as many samples, but at least so often.
 SHOW_SECONDS = 5.0
 
@@ -91,6 +94,9 @@ class Slider:
     unit: str = ""
     log: bool = False
 
+    def __post_init__(self):
+        self.first = self.value
+
     def event(self) -> dict:
         return {
             "name": self.name,
@@ -99,6 +105,7 @@ class Slider:
             "max": self.most,
             "step": self.step,
             "value": self.value,
+            "first": self.first,
             "log": self.log,
             "unit": self.unit,
         }
@@ -241,11 +248,15 @@ class Viewfinder:
         self.seconds = FRAME_SECONDS  # nothing is known of that size
 
     def refine(self) -> None:
-        """Trace a piece of the picture in full size, and show that from time to time."""
+        """Trace a piece of the picture at rest, and show that from time to time.
+
+        Its size doubles with the first passes until there is no room for more: who waits sees
+        something better at once.
+        """
         if self.canvas is None:
-            self.canvas = self.preview.canvas(*self._size(self.room[0]))
-            self.shown, self.shown_at = 0, time.perf_counter()
+            self._start(2 * self.width)
         canvas = self.canvas
+        assert canvas is not None
         if not self._is_due():
             start = time.perf_counter()
             count = min(self.piece, canvas.left)
@@ -254,8 +265,15 @@ class Viewfinder:
                 ratio = PIECE_SECONDS / (time.perf_counter() - start)
                 self.piece = int(max(LEAST_PIECE, count * max(0.5, min(2, ratio))))
         if self._is_due() and self.link.ready:
-            self._show(canvas, quick=canvas.passes < 16, moving=False)
+            self._show(canvas, quick=canvas.passes < FEW_PASSES, moving=False)
             self.shown, self.shown_at = canvas.passes, time.perf_counter()
+            if canvas.width < self._size(self.room[0])[0]:
+                self._start(2 * canvas.width)
+
+    def _start(self, width: int) -> None:
+        """Begin with a picture of about a width, or as wide as there is room for."""
+        self.canvas = self.preview.canvas(*self._size(width))
+        self.shown, self.shown_at = 0, time.perf_counter()
 
     def _is_due(self) -> bool:
         """Whether the picture that refines has come so far that it is to be shown."""
@@ -338,7 +356,7 @@ class Viewfinder:
         room = max(SMALLEST, int(width)), max(1, int(height))
         if room != self.room:
             self.room, self.canvas = room, None
-        self.stale = True
+        self.stale |= self.picture is None
 
     def _do_look(self, message: dict) -> None:
         dx, dy = message["by"]

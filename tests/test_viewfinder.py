@@ -69,7 +69,10 @@ def look(rgb, tmp_path, monkeypatch):
 
     def open_(sensor="perspective", lens="", **job):
         path = tmp_path / "scene.xml"
-        path.write_text(SCENE.format(sensor=sensor, lens=lens))
+        text = SCENE.format(sensor=sensor, lens=lens)
+        if sensor in ("spherical", "orthographic"):  # which have no field of view
+            text = text.replace('<float name="fov" value="$fov"/>', "")
+        path.write_text(text)
         window = Window()
         opened = jobs.open_scene(jobs.Job(str(path), **job), aiming=True)
         finder = viewfinder.Viewfinder(opened, [], window)
@@ -102,6 +105,7 @@ def test_whoever_comes_is_told_of_the_scene_and_sees_it(look):
     header, jpeg = window.frames[-1]
     assert jpeg[:2] == b"\xff\xd8" and header["size"] == [48, 32]
     assert [frame["spp"] for frame, _ in window.frames] == [1, 1, 2]  # a glance, and refined
+    assert [slider["first"] for slider in scene["sliders"] if slider["name"] == "fov"] == [50]
     assert [frame["frame"] for frame, _ in window.frames] == [1, 2, 3]
 
 
@@ -160,7 +164,7 @@ def test_what_is_pointed_at_is_told(look):
     while not window.told("under"):
         finder._work()
     under = window.told("under")[-1]
-    assert under["shape"] == '"ball"' and under["cell"] == (0, 0, 0)
+    assert under["shape"] == "ball" and under["cell"] == (0, 0, 0)
     assert math.dist(under["position"], (0.5, 0.5, 0.5)) == pytest.approx(0.2, abs=1e-3)
     finder.answer({"do": "point", "at": None})
     assert window.told("under")[-1]["shape"] is None
@@ -195,6 +199,24 @@ def test_another_exposure_traces_nothing(look, monkeypatch):
     assert len(window.frames) == 3
     assert window.frames[-1][0]["spp"] == window.frames[-2][0]["spp"]
     assert window.frames[-1][1] != window.frames[-2][1]
+
+
+def test_a_picture_at_rest_grows_to_the_size_that_there_is_room_for(look):
+    finder, window = look()
+    finder.width = 160
+    finder.answer({"do": "size", "size": [960, 640]})
+    work(finder, 4)
+    sizes = [frame["size"] for frame, _ in window.frames]
+    assert sizes == [[160, 107], [320, 213], [640, 427], [960, 640]]
+
+
+def test_another_size_of_the_page_keeps_what_is_seen(look):
+    finder, window = look()
+    work(finder, 3)
+    finder.answer({"do": "size", "size": [96, 64]})
+    assert not finder.stale
+    work(finder, 1)
+    assert window.frames[-1][0]["size"] == [96, 64]
 
 
 def test_fog_takes_light_away_and_can_be_cleared(look):
