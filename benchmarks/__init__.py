@@ -9,6 +9,7 @@ Run from the root of a checkout, with the extra ``test`` installed (``chart`` fo
     python -m benchmarks.speed               # cost against ``path``
     python -m benchmarks.accuracy            # images at two tolerances
     python -m benchmarks.emitter_sampling    # what emitter sampling is worth
+    python -m benchmarks.walk                # pictures a second in the viewfinder
     python -m benchmarks.stills              # what passes, layers and checkpoints cost
     python -m benchmarks.offsets             # whether next rays leave their surface, and leaks
 
