@@ -4,6 +4,7 @@ somewhere."""
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -161,6 +162,17 @@ def test_commands_run(desk, block):
     assert " ".join(printed_by(block).split()) in " ".join(" ".join(printed).split())
 
 
+def look(desk, arguments):
+    """Run the viewfinder until it says where its page is; Ctrl-C ends it."""
+    with subprocess.Popen(
+        arguments, cwd=desk, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    ) as process:
+        url = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+    assert process.returncode == 0 and url.startswith("http://127.0.0.1:")
+    return url
+
+
 def run_small(desk, line):
     program, *words = shlex.split(line)
     command = [sys.executable, "-c", "from nil_mitsuba.cli import main; main()"]
@@ -178,6 +190,8 @@ def run_small(desk, line):
         # Scenes of the project take their size as parameters; the README's own is small
         size = [] if "hello.xml" in words else ["-D", "resx=32", "-D", "resy=18"]
         return run(desk, [*command, *words, *size, "--spp", "2"])
+    elif program == "nil-mitsuba" and words[0] == "view":
+        return look(desk, [*command, *words, "--no-browser"])
     elif program == "nil-mitsuba" and words[0] == "fly":
         size = ["-D", "resx=32", "-D", "resy=18", "--spp", "2", "--frames", "2"]
         return run(desk, [*command, *words, *size])
