@@ -1,7 +1,8 @@
 """The way of a camera by keys: where it is in each frame, how it is turned, and what it is set to.
 
-From key to key it moves along the shortest geodesic. Its view is turned in the left-invariant frame
-about one axis, and its parameters change along with both.
+From key to key it moves along the shortest geodesic. Its view is turned in the left-invariant
+frame, with a level horizon if both keys have one, or else about one axis. Its parameters change
+along with both.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from itertools import accumulate
 import drjit.scalar as ds
 
 from . import geometry
+from .aiming import LEVEL
 from .keys import Key, UnfitError
 from .pose import Chart, Pose, Vector, cross, dot, rotated, unit
 
@@ -132,8 +134,8 @@ class _Leg:
         target = geometry.multiply(ds.Array3f64(step), end.pose.place, k)
         way = geometry.connect(start.pose.place, target, k)
         self.direction, self.distance = way.direction, way.distance
-        self.axis, self.angle = rotation(start.axes, end.axes)
-        self.measure = math.hypot(self.distance, self.angle, *_changes(start, end))
+        self.turn = _LevelTurn.between(start, end) or _Turn(start, end)
+        self.measure = math.hypot(self.distance, self.turn.angle, *_changes(start, end))
 
     def at(self, part: float) -> tuple[Pose, dict[str, float]]:
         """Pose and parameters on a part of the way, from 0 to 1."""
@@ -141,7 +143,7 @@ class _Leg:
         place, _ = geometry.flow(
             start.pose.place, self.direction, part * self.distance, self.chart.twist
         )
-        axes = tuple(rotated(v, self.axis, part * self.angle) for v in start.axes)
+        axes = self.turn.at(part)
         # In equal ratios, as a zoom is even
         sizes = tuple(a ** (1 - part) * b**part for a, b in zip(start.sizes, end.sizes))
         pose = _posed(place, axes, sizes, start.mirrored, start.pose.cell).within(self.chart)
@@ -150,6 +152,68 @@ class _Leg:
             a, b = _extent(name, value), _extent(name, end.parameters[name])
             parameters[name] = _of_extent(name, (1 - part) * a + part * b)
         return pose, parameters
+
+
+class _Turn:
+    """The turn of a view from one key to the next, about one axis; ``angle`` in radians."""
+
+    def __init__(self, start: _Stop, end: _Stop):
+        self.axes = start.axes
+        self.axis, self.angle = rotation(start.axes, end.axes)
+
+    def at(self, part: float) -> tuple[Vector, ...]:
+        """Left, up and view after a part of it, from 0 to 1."""
+        return tuple(rotated(v, self.axis, part * self.angle) for v in self.axes)
+
+
+class _LevelTurn:
+    """A turn with a level horizon: about what is upright in both views, and up or down.
+
+    About one axis the horizon would roll on the way between views of different heights.
+    """
+
+    def __init__(self, start: _Stop, end: _Stop, upright: Vector):
+        self.axes, self.upright = start.axes, upright
+        (left, _, view), (other, _, other_view) = start.axes, end.axes
+        self.aside = math.atan2(dot(cross(left, other), upright), dot(left, other))
+        below, above = (_height(v, upright) for v in (view, other_view))
+        self.rise = above - below
+        across = math.cos((below + above) / 2)
+        self.angle = math.hypot(across * self.aside, self.rise)
+        # Level is what is so but for rounding, which the last key keeps
+        self.rest = rotation(self._level(1.0), end.axes)
+
+    @classmethod
+    def between(cls, start: _Stop, end: _Stop) -> _LevelTurn | None:
+        """The turn between two views, if they have the same upright axis."""
+        first, last = (_upright(stop.axes) for stop in (start, end))
+        if first is None or first != last:
+            return None
+        return cls(start, end, ds.Array3f64(first))
+
+    def at(self, part: float) -> tuple[Vector, ...]:
+        """As of `_Turn`."""
+        axis, angle = self.rest
+        return tuple(rotated(v, axis, part * angle) for v in self._level(part))
+
+    def _level(self, part):
+        aside = [rotated(v, self.upright, part * self.aside) for v in self.axes]
+        return tuple(rotated(v, -aside[0], part * self.rise) for v in aside)
+
+
+def _upright(axes: tuple[Vector, ...]) -> list[float] | None:
+    """The axis (of the cell's) about which a view is level, upwards; None if there is none."""
+    left, up, _ = axes
+    level = [i for i in range(3) if abs(left[i]) < LEVEL and abs(up[i]) > LEVEL]
+    if not level:
+        return None
+    axis = max(level, key=lambda i: abs(up[i]))
+    return [math.copysign(float(i == axis), up[axis]) for i in range(3)]
+
+
+def _height(view: Vector, upright: Vector) -> float:
+    """Angle (radians) of a view above the horizon."""
+    return math.asin(max(-1.0, min(1.0, dot(view, upright))))
 
 
 def rotation(a: Sequence[Vector], b: Sequence[Vector]) -> tuple[Vector, float]:

@@ -185,6 +185,26 @@ def test_a_camera_that_turns_on_the_spot_turns_evenly_about_one_axis():
         close(frame, pose(axis=axis, angle=0.2 + 3 * i / 8))
 
 
+@pytest.mark.parametrize("upright", [(0, 0, 1), (0, -1, 0)])
+def test_between_level_views_the_horizon_stays_level(upright):
+    """About one axis it would lean by up to ten degrees here."""
+    axis = ds.Array3f64(upright)
+    level = pose(axis=(1, 0, 0), angle=math.pi / 2)  # up along z, and looks along −y
+    if upright[1]:
+        level = pose(axis=(0, 0, 1), angle=math.pi)
+    start, end = (
+        level.__class__(**{**vars(level), "upright": axis}).turned(aside, above)
+        for aside, above in ((0.3, -0.5), (-1.4, 0.6))
+    )
+    seen = poses(flight(key(start), key(end)))
+    heights = [math.asin(float(sum(a * b for a, b in zip(p.view, axis)))) for p in seen]
+    assert all(abs(sum(a * b for a, b in zip(p.left, axis))) < 1e-9 for p in seen)
+    steps = [b - a for a, b in zip(heights, heights[1:])]
+    assert steps == pytest.approx([1.1 / 8] * 8)
+    close(seen[0], start)
+    close(seen[-1], end)
+
+
 def test_a_camera_stays_as_large_and_as_mirrored_as_its_matrix():
     a, b = pose(sizes=(-2, 2, 3)), pose(angle=0.9, sizes=(-8, 8, 3))
     middle = flight(key(a), key(b), frames=3).at(1)[0]
