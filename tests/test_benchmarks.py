@@ -80,3 +80,17 @@ def test_images_of_both_tolerances_are_compared():
     done = run("benchmarks.accuracy", "--quick", "--only", "furnished cell")
     assert done.returncode == 0, done.stderr[-2000:]
     assert "mean" in done.stdout and "squares of 4x4 pixels off" in done.stdout
+
+
+@pytest.mark.verify
+def test_every_workload_runs():
+    done = run("benchmarks.speed", "--quick")
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.verify
+def test_the_viewfinder_is_timed():
+    done = run("benchmarks.walk", "--frames", "3")
+    assert done.returncode == 0, done.stderr[-2000:]
+    rows = [line.split() for line in done.stdout.splitlines() if line.split()[1:2] == ["yes"]]
+    assert [row[0] for row in rows] == ["showcase", "cornell-box"]

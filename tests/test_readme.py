@@ -42,10 +42,10 @@ TESTED_BY = {
     "examples/light_images.py": "test_examples.py",
     "examples/own_mesh.py": "test_examples.py",
     "examples/all_around.py": "test_examples.py",
+    "benchmarks.speed": "test_benchmarks.py",
 }
 QUICK = (
     "benchmarks.camera_rays",
-    "benchmarks.speed",
     "benchmarks.accuracy",
     "benchmarks.emitter_sampling",
     "benchmarks.stills",
