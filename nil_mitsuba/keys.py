@@ -17,7 +17,7 @@ PARAMETERS = {
     "aperture_radius": (lambda x: 0 <= x < FAR, "a length from 0 on"),
 }
 FAR = 1e15  # scene units, as of shapes
-MOST_CELLS = 10**6  # so far along each axis; products of two such are exact in double precision
+MOST_CELLS = 10**6  # so far along each axis: products of two such are exact in double precision
 
 # The sides of a camera may be so far from a right angle (cosine): matrices are often written with
 # four digits
@@ -54,8 +54,8 @@ def load(path: str | os.PathLike) -> list[Key]:
     is no key file.
     """
     try:
-        with open(path, encoding="utf-8") as file:
-            contents = json.load(file)
+        with open(path, encoding="utf-8-sig") as file:  # some editors put a mark before the text
+            contents = json.load(file, object_pairs_hook=_once_each)
     except OSError as error:
         raise OSError(f'cannot read "{path}": {error.strerror or error}.') from None
     except (UnicodeDecodeError, RecursionError):
@@ -64,6 +64,10 @@ def load(path: str | os.PathLike) -> list[Key]:
         raise ValueError(
             f'"{path}" is not JSON: {error.msg} in line {error.lineno}, column {error.colno}.'
         ) from None
+    except _WrongError as error:
+        raise ValueError(f'"{path}" is no key file: {error}.') from None
+    except ValueError:  # Python's, of thousands of digits
+        raise ValueError(f'"{path}" is no key file: a number in it has too many digits.') from None
     listed = contents.get("keys") if isinstance(contents, dict) else None
     if not isinstance(listed, list) or contents.keys() != {"keys"}:
         raise ValueError(
@@ -96,6 +100,16 @@ def save(path: str | os.PathLike, keys: list[Key]) -> None:
 
 class _WrongError(Exception):
     """What is wrong with a key, and what would be right."""
+
+
+def _once_each(pairs: list[tuple[str, object]]) -> dict:
+    """An object of JSON, of which Python would take the last of two values with one name."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise _WrongError(f'"{twice}" stands twice in one object')
+    return found
 
 
 def _key(entry) -> Key:
@@ -138,8 +152,8 @@ def _matrix(value) -> list[float]:
         )
     columns = [matrix[i:12:4] for i in range(3)]
     sizes = [math.hypot(*column) for column in columns]
-    if not all(sizes):
-        raise _WrongError('the first three columns of "to_world" must not be 0')
+    if not all(size > 1 / FAR for size in sizes):
+        raise _WrongError('the first three columns of "to_world" must be longer than 1e-15')
     for i in range(3):
         a, b = columns[i - 1], columns[i]
         cosine = sum(x * y for x, y in zip(a, b)) / (sizes[i - 1] * sizes[i])

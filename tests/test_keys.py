@@ -40,6 +40,13 @@ def test_a_file_by_hand_needs_whole_numbers_no_points(tmp_path):
     ]
 
 
+def test_a_mark_before_the_text_does_no_harm(tmp_path):
+    path = tmp_path / "cameras.json"
+    keys.save(path, [Key(MATRIX)])
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert keys.load(path) == [Key(MATRIX)]
+
+
 def sheared():
     return [1, 0.1, *MATRIX[2:]]
 
@@ -54,8 +61,11 @@ def sheared():
         ("[]", r'must be one object {"keys": \[...\]}'),
         ('{"keys": 3}', r'must be one object {"keys": \[...\]}'),
         ('{"keys": [], "fps": 25}', "with nothing beside"),
+        ('{"keys": [], "keys": []}', '"keys" stands twice in one object'),
+        ('{"keys": [{"x_fov": 40, "x_fov": 50}]}', '"x_fov" stands twice in one object'),
+        ('{"keys": [1%s]}' % ("0" * 5000), "a number in it has too many digits"),
     ],
-    ids=range(7),
+    ids=range(10),
 )
 def test_what_is_no_key_file_is_refused(tmp_path, text, words):
     path = tmp_path / "cameras.json"
@@ -76,7 +86,8 @@ def test_what_is_no_key_file_is_refused(tmp_path, text, words):
         ({"to_world": [10**400, *MATRIX[1:]]}, "with 10000"),
         ({"to_world": [*MATRIX[:3], 1e16, *MATRIX[4:]]}, "must be below 1e15"),
         ({"to_world": [MATRIX[4 * (i % 4) + i // 4] for i in range(16)]}, "row 0, 0, 0, 1"),
-        ({"to_world": [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "must not be 0"),
+        ({"to_world": [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "must be longer"),
+        ({"to_world": [c * 1e-200 for c in MATRIX[:12]] + [0, 0, 0, 1]}, "must be longer"),
         ({"to_world": sheared()}, "must be at right angles"),
         ({"to_world": MATRIX, "cell": [0, 1]}, '"cell" must be a list of three whole numbers'),
         ({"to_world": MATRIX, "cell": [0, 1.0, 2]}, '"cell" must be'),
@@ -92,7 +103,7 @@ def test_what_is_no_key_file_is_refused(tmp_path, text, words):
         ({"to_world": MATRIX, "x_fow": 45}, 'no "x_fow": did you mean "x_fov"'),
         ({"to_world": MATRIX, "film": {}}, "a key may have aperture_radius, cell"),
     ],
-    ids=range(21),
+    ids=range(22),
 )
 def test_a_key_that_is_none_is_named(tmp_path, entry, words):
     path = tmp_path / "cameras.json"
