@@ -17,7 +17,7 @@ import drjit.scalar as ds
 
 from . import geometry
 from .aiming import LEVEL
-from .keys import Key, UnfitError
+from .keys import MOST_CELLS, Key, UnfitError
 from .pose import Chart, Pose, Vector, cross, dot, rotated, unit
 
 # The last key is an image of the first if they are no further apart than this (cells, radians,
@@ -48,6 +48,12 @@ class Flight:
                 )
             for parameter in key.parameters.keys() - parameters.keys():
                 raise UnfitError(f'{name}: the scene\'s sensor has no "{parameter}" to set.')
+            place = chart.to_cells(key.to_world[3:12:4])
+            if not max(map(abs, place)) <= MOST_CELLS:
+                raise UnfitError(
+                    f'{name}: its "to_world" is more than a million cells from the origin of the '
+                    "cell, where places are too coarse for a way."
+                )
             stop = _Stop.of(key, chart, {**parameters, **key.parameters})
             if self.stops and stop.mirrored != self.stops[0].mirrored:
                 raise UnfitError(
@@ -66,7 +72,7 @@ class Flight:
     def at(self, frame: int) -> tuple[Pose, dict[str, float]]:
         """The camera's pose and parameters in a frame, counted from 0."""
         if frame and frame == self.steps:
-            return self.legs[-1].at(1.0)  # whatever rounding makes of the sum
+            return self.stops[-1].pose, self.stops[-1].parameters  # whatever rounding makes of it
         here = self.marks[-1] * frame / max(self.steps, 1)
         index = min(bisect_right(self.marks, here), len(self.legs)) - 1
         leg = self.legs[index]

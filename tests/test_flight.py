@@ -15,6 +15,7 @@ from nil_mitsuba.pose import Chart, Pose, rotated
 CHART = Chart(1.0, True, (0.0, 0.0, 0.0), 1.0, (0, 1, 2))
 CELLS_OF_TWO = Chart(1.0, True, (-1.0, 0.0, 0.5), 2.0, (2, 0, 1))  # fibres along the scene's y
 OPEN = Chart(0.37, False, (0.0, 0.0, 0.0), 1.0, (0, 1, 2))
+AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def pose(place=(0.25, 0.1, 0.7), axis=(0.3, -0.5, 0.8), angle=0.7, sizes=(1, 1, 1), cell=(0, 0, 0)):
@@ -88,11 +89,25 @@ def test_a_flight_far_from_the_first_cell_is_as_exact_as_near_it():
         close(carried(near), there)
 
 
+def test_the_last_frame_is_the_last_key_however_far_that_is():
+    last = pose((0.7, 0.4, 0.2), cell=(10**6, -(10**6), 10**6))
+    close(flight(key(pose()), key(last)).at(8)[0], last, 1e-15)
+
+
+@pytest.mark.parametrize("chart", [CHART, CELLS_OF_TWO, OPEN], ids=["cell", "turned", "open"])
+def test_a_key_that_stands_too_far_away_is_named(chart):
+    far = Pose(ds.Array3f64(0.5, 1.1e6, 0.5), *(ds.Array3f64(v) for v in AXES), AXES[1])
+    with pytest.raises(UnfitError, match="key 2 of 2: .* more than a million cells"):
+        flight(key(pose(), chart), key(far, chart), chart=chart)
+    near = Pose(ds.Array3f64(0.5, 0.9e6, 0.5), far.left, far.up, far.view, far.upright)
+    flight(key(pose(), chart), key(near, chart), chart=chart)
+
+
 def test_the_first_and_the_last_frame_are_the_first_and_the_last_key():
     ends = pose(), pose((0.9, 0.2, 0.4), angle=2.0)
     way = flight(key(ends[0]), key(pose(angle=-1.0)), key(ends[1]), frames=5)
     close(way.at(0)[0], ends[0])
-    close(way.at(4)[0], ends[1], 1e-9)
+    close(way.at(4)[0], ends[1])
     close(flight(key(ends[0]), key(ends[1]), frames=1).at(0)[0], ends[0])
 
 
