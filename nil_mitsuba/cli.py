@@ -38,6 +38,7 @@ from .signals import Watch
 from .sums import name_noise, name_passes
 
 SUMS = ".sums"  # suffix of checkpoints and parts
+MOST_FRAMES = 10**6  # eleven hours of film; seeds of passes are further apart
 
 
 class Assignment(click.ParamType):
@@ -611,7 +612,7 @@ def _viewfinder(job: jobs.Job, link):
     metavar="CAMERAS.json",
     help="The cameras by which the flight leads.",
 )
-@click.option("--frames", required=True, type=click.IntRange(1), help="How many.")
+@click.option("--frames", required=True, type=click.IntRange(1, MOST_FRAMES), help="How many.")
 @click.option(
     "-o",
     "--output",

@@ -299,7 +299,8 @@ def test_quiet_means_nothing_but_errors(command, film):
 @pytest.mark.parametrize(
     "arguments, status, words",
     [
-        (["--frames", "0"], 2, "0 is not in the range x>=1"),
+        (["--frames", "0"], 2, "0 is not in the range 1<=x<=1000000"),
+        (["--frames", "1000001"], 2, "1000001 is not in the range"),
         ([], 2, "Missing option '--frames'"),
         (["--frames", "2", "--keys", "none.json"], 1, 'cannot read "none.json": No such file'),
         (["--frames", "2", "--keys", "scene.xml"], 1, '"scene.xml" is not JSON'),
@@ -328,7 +329,7 @@ def test_quiet_means_nothing_but_errors(command, film):
         (["--frames", "2", "--workers", "2", "--scheduler", "tcp://a:1"], 2, "names another"),
         (["--frames", "2", "-s", "1"], 1, "has no sensor 1"),
     ],
-    ids=range(16),
+    ids=range(17),
 )
 def test_a_flight_that_cannot_begin_is_refused_in_a_sentence(
     command, film, rendering_is_an_error, arguments, status, words
