@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass, replace
@@ -67,9 +68,11 @@ class Frames:
         self.warned = True
         self.film = still.film
         rules = still.rules  # the scene's samples, if the plan names none
+        keys = json.dumps([key.as_dict() for key in plan.keys])
         self.settings = {
             "frames": plan.count,
-            "keys": [key.as_dict() for key in plan.keys],
+            # Thousands of keys in each file would be more than its picture
+            "keys": hashlib.sha256(keys.encode()).hexdigest(),
             "spp": rules.spp,
             "time": rules.seconds,
             "noise": rules.noise,

@@ -223,6 +223,16 @@ def test_what_is_no_frame_is_refused_before_anything_is_rendered(
             "another folder (-o).",
         )
         (film / "film" / f"0001.{form}").write_text("hello")
+def test_a_frame_by_a_thousand_keys_is_no_larger(command, film):
+    sizes = []
+    for middle in (0, 998):
+        keys.save("cameras.json", [start(), *[end()] * middle, end()])
+        out = f"film{middle}"
+        assert command(*FLY, "--frames", "2", "-o", out)[0] == 0
+        sizes.append((film / out / "0000.exr").stat().st_size)
+    assert sizes[1] < sizes[0] + 100
+
+
         status, _, err = command(*FLY, "--frames", "2", "--format", form)
         assert status == 1 and f'"film/0001.{form}" is not a' in complaint(err)
 
