@@ -197,6 +197,20 @@ def test_frames_of_another_flight_are_refused(command, film):
         assert line.endswith("; remove it, or write to another folder (-o).")
 
 
+def test_frames_that_are_written_otherwise_are_refused(command, film):
+    for form, *arguments, words in (
+        ("png", "--exposure", "1", "exposure is 0.0 there and 1.0 here"),
+        ("png", "--filmic", "filmic is False there and True here"),
+        ("exr", "--denoise", "denoise is False there and True here"),
+    ):
+        if "--denoise" in arguments:
+            pytest.importorskip("mitsuba_oidn")
+        fly = (*FLY, "--frames", "1", "--format", form)
+        assert command(*fly)[0] == 0
+        status, out, err = command(*fly, *arguments)
+        assert (status, out) == (1, "") and words in complaint(err)
+
+
 def test_frames_by_other_keys_or_of_another_scene_are_refused(command, film):
     fly = (*FLY, "--frames", "2", "--format", "png")
     assert command(*fly)[0] == 0
