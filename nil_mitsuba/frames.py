@@ -144,16 +144,27 @@ def is_there(path: str | os.PathLike, settings: dict) -> bool:
     if not os.path.lexists(path):
         return False
     advice = "remove it, or write to another folder (-o)."
-    if Path(path).suffix == ".png":
-        text = png.texts_of(path).get("flight")
-    else:
-        attribute = exr_header.read(path)[0].get("flight")
-        text = attribute and attribute.value
-        if not exr_header.is_complete(path):
-            raise ValueError(f'"{path}" is damaged: {advice}')
-    if not text:
+    try:
+        text = _mark_of(path)
+    except ValueError as error:
+        raise ValueError(f"{str(error).rstrip('.')}: {advice}") from None
+    try:
+        there = json.loads(text)
+    except (TypeError, ValueError):  # no text, or another program's
+        there = None
+    if not isinstance(there, dict):
         raise ValueError(f'"{path}" is no frame of a flight: {advice}')
-    found = list(differences(json.loads(text), json.loads(json.dumps(settings))))
+    found = list(differences(there, json.loads(json.dumps(settings))))
     if found:
         raise ValueError(f'"{path}" is a frame of another flight: {"; ".join(found)}; {advice}')
     return True
+
+
+def _mark_of(path: str | os.PathLike):
+    """What a file tells of its flight; None if nothing. Raises ValueError if it is damaged."""
+    if Path(path).suffix == ".png":
+        return png.texts_of(path).get("flight")
+    attribute = exr_header.read(path)[0].get("flight")
+    if not exr_header.is_complete(path):
+        raise ValueError(f'"{path}" is damaged.')
+    return attribute and attribute.value

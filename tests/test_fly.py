@@ -223,6 +223,16 @@ def test_frames_by_other_keys_or_of_another_scene_are_refused(command, film):
     assert status == 1 and "the scene or a file that it names has changed" in complaint(err)
 
 
+def test_a_frame_by_a_thousand_keys_is_no_larger(command, film):
+    sizes = []
+    for middle in (0, 998):
+        keys.save("cameras.json", [start(), *[end()] * middle, end()])
+        out = f"film{middle}"
+        assert command(*FLY, "--frames", "2", "-o", out)[0] == 0
+        sizes.append((film / out / "0000.exr").stat().st_size)
+    assert sizes[1] < sizes[0] + 100
+
+
 def test_what_is_no_frame_is_refused_before_anything_is_rendered(
     command, film, rendering_is_an_error
 ):
@@ -237,26 +247,33 @@ def test_what_is_no_frame_is_refused_before_anything_is_rendered(
             "another folder (-o).",
         )
         (film / "film" / f"0001.{form}").write_text("hello")
-def test_a_frame_by_a_thousand_keys_is_no_larger(command, film):
-    sizes = []
-    for middle in (0, 998):
-        keys.save("cameras.json", [start(), *[end()] * middle, end()])
-        out = f"film{middle}"
-        assert command(*FLY, "--frames", "2", "-o", out)[0] == 0
-        sizes.append((film / out / "0000.exr").stat().st_size)
-    assert sizes[1] < sizes[0] + 100
-
-
         status, _, err = command(*FLY, "--frames", "2", "--format", form)
-        assert status == 1 and f'"film/0001.{form}" is not a' in complaint(err)
+        assert status == 1 and re.search(
+            f'"film/0001.{form}" is not an? .*: remove it, or write', complaint(err)
+        )
+
+
+@pytest.mark.parametrize("mark", [5, "hello", "[]", "null"])
+@pytest.mark.parametrize("form", ["exr", "png"])
+def test_what_other_programs_tell_of_a_flight_makes_no_frame(film, form, mark):
+    path = film / f"a.{form}"
+    picture = mi.Bitmap(dr.ones(mi.TensorXf, (2, 2, 3)))
+    if form == "png":
+        mark, picture = str(mark), picture.convert(component_format=mi.Struct.Type.UInt8)
+    picture.metadata()["flight"] = mark
+    picture.write(str(path))
+    with pytest.raises(ValueError, match=f'a.{form}" is no frame of a flight: remove it, or'):
+        frames.is_there(path, {})
 
 
 def test_half_a_frame_is_told(command, film):
     assert command(*FLY, "--frames", "2")[0] == 0
-    path = film / "film" / "0001.exr"
-    path.write_bytes(path.read_bytes()[:-50])
-    status, _, err = command(*FLY, "--frames", "2")
-    assert status == 1 and '0001.exr" is damaged: remove it' in complaint(err)
+    assert command(*FLY, "--frames", "2", "--format", "png")[0] == 0
+    for form in ("exr", "png"):
+        path = film / "film" / f"0001.{form}"
+        path.write_bytes(path.read_bytes()[:-50])
+        status, _, err = command(*FLY, "--frames", "2", "--format", form)
+        assert status == 1 and f'0001.{form}" is damaged: remove it' in complaint(err)
 
 
 # --------------------------------------------------------------------- interruptions
