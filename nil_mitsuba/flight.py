@@ -192,10 +192,12 @@ class _LevelTurn:
     @classmethod
     def between(cls, start: _Stop, end: _Stop) -> _LevelTurn | None:
         """The turn between two views, if they have the same upright axis."""
-        first, last = (_upright(stop.axes) for stop in (start, end))
-        if first is None or first != last:
+        first, last = (_uprights(stop.axes) for stop in (start, end))
+        both = first.keys() & last.keys()
+        if not both:
             return None
-        return cls(start, end, ds.Array3f64(first))
+        axis, sign = max(both, key=lambda upright: first[upright] + last[upright])
+        return cls(start, end, ds.Array3f64([sign * (i == axis) for i in range(3)]))
 
     def at(self, part: float) -> tuple[Vector, ...]:
         """As of `_Turn`."""
@@ -207,14 +209,15 @@ class _LevelTurn:
         return tuple(rotated(v, -aside[0], part * self.rise) for v in aside)
 
 
-def _upright(axes: tuple[Vector, ...]) -> list[float] | None:
-    """The axis (of the cell's) about which a view is level, upwards; None if there is none."""
+def _uprights(axes: tuple[Vector, ...]) -> dict[tuple[int, float], float]:
+    """The axes (of the cell's), with the sign of what is upwards, about which a view is level, and
+    how far its up leads along each: two for a view up or down along an axis' plane, or none."""
     left, up, _ = axes
-    level = [i for i in range(3) if abs(left[i]) < LEVEL and abs(up[i]) > LEVEL]
-    if not level:
-        return None
-    axis = max(level, key=lambda i: abs(up[i]))
-    return [math.copysign(float(i == axis), up[axis]) for i in range(3)]
+    return {
+        (i, math.copysign(1.0, up[i])): abs(up[i])
+        for i in range(3)
+        if abs(left[i]) < LEVEL and abs(up[i]) > LEVEL
+    }
 
 
 def _height(view: Vector, upright: Vector) -> float:

@@ -220,6 +220,14 @@ def test_between_level_views_the_horizon_stays_level(upright):
     close(seen[-1], end)
 
 
+def test_steep_views_along_axes_have_the_horizon_that_both_are_level_with():
+    """Each by itself might as well be level about another axis, which it is nearer to."""
+    level = pose(axis=(1, 0, 0), angle=math.pi / 2)  # up along z, and looks along −y
+    level = level.__class__(**{**vars(level), "upright": ds.Array3f64(0, 0, 1)})
+    start, end = level.turned(0, -1.05), level.turned(math.pi / 2, -0.9)
+    assert all(abs(seen.left[2]) < 1e-9 for seen in poses(flight(key(start), key(end))))
+
+
 def test_a_camera_stays_as_large_and_as_mirrored_as_its_matrix():
     a, b = pose(sizes=(-2, 2, 3)), pose(angle=0.9, sizes=(-8, 8, 3))
     middle = flight(key(a), key(b), frames=3).at(1)[0]
