@@ -120,6 +120,16 @@ def test_past_a_key_the_speed_stays_the_same():
     assert sorted(steps)[1:] == pytest.approx([way.length / 1000] * 999, rel=1e-6)
 
 
+def test_way_turn_and_zoom_count_like_sides_at_right_angles():
+    # 0.3 cells and 0.4 radians together are 0.5, and so is the zoom behind them: half of the frames
+    ends = key(pose((0.2, 0.2, 0.2))), key(pose((0.2, 0.2, 0.5), angle=1.1))
+    wide = key(pose((0.2, 0.2, 0.5), angle=1.1), focus_distance=2.0)
+    way = flight(*ends, wide, focus_distance=1.0)
+    assert way.at(4)[1]["focus_distance"] == pytest.approx(1)
+    assert way.at(5)[1]["focus_distance"] == pytest.approx(1.25)
+    close(way.at(4)[0], pose((0.2, 0.2, 0.5), angle=1.1), 1e-9)
+
+
 # --------------------------------------------------------------------------- loops
 
 
