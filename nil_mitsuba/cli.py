@@ -40,6 +40,9 @@ from .sums import name_noise, name_passes
 SUMS = ".sums"  # suffix of checkpoints and parts
 MOST_FRAMES = 10**6  # eleven hours of film; seeds of passes are further apart
 
+# A browser that has to be started shows a page within so many seconds.
+COMING_SECONDS = 10.0
+
 
 class Assignment(click.ParamType):
     """``key=value`` as a pair of strings."""
@@ -576,15 +579,18 @@ def view(
     )
     with server.serve(port or 0) as link, stills.interruption() as signals:
         click.echo(link.url)
-        if browser:
-            webbrowser.open(link.url)
+        opened = browser and webbrowser.open(link.url)
         try:
             finder = _viewfinder(job, link)
         except Exception as error:
-            sentence = tidy(str(cause_of(error)))
-            link.send({"is": "end", "text": sentence})
-            if browser:
+            sentence = tidy(str(cause_of(error)) or type(error).__name__)
+            if opened:
+                # Most errors are found before a browser has got the page
                 _note(f"nil-mitsuba: {sentence}")
+                link.await_viewer(COMING_SECONDS, lambda: bool(signals))
+            link.send({"is": "end", "text": sentence})
+            if opened and verbose < 2:  # the sentence has been said
+                raise click.exceptions.Exit(1) from error
             raise
         finder.run(ended=lambda: bool(signals))
         link.send({"is": "end", "text": "The command has ended."})

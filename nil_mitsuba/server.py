@@ -19,6 +19,7 @@ import re
 import secrets
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
@@ -46,6 +47,8 @@ MESSAGE_SIZE = 2**16
 # Seconds for a browser on this computer to say hello, and to answer when it is told goodbye.
 HELLO_SECONDS = 10.0
 GOODBYE_SECONDS = 1.0
+
+SIGNAL_SECONDS = 0.1  # between two looks at whether a signal has come
 
 # Why a connection ends, as RFC 6455 numbers it; from 4000 on numbers are the application's.
 GOING_AWAY, REFUSED, TAKEN = 1001, 1008, 4001
@@ -177,6 +180,14 @@ class Link:
             taken, self._inbox, self._drawn = self._inbox, [], False
         return taken
 
+    def await_viewer(self, seconds: float, ended: Callable[[], bool]) -> None:
+        """Wait until somebody is there, for so long, or until ``ended``."""
+        stop = time.monotonic() + seconds
+        with self._changed:
+            while not (self._viewer or ended() or time.monotonic() > stop):
+                # A signal wakes nobody here: it is looked at between
+                self._changed.wait(SIGNAL_SECONDS)
+
     def send(self, event: dict[str, Any]) -> None:
         """Tell the page something; nothing happens if nobody is there.
 
@@ -207,6 +218,7 @@ class Link:
             taken = self._viewer is not None
             if not taken:
                 self._viewer = viewer
+                self._changed.notify_all()
         if taken:
             connection.close(TAKEN, TAKEN_SENTENCE)
             return
