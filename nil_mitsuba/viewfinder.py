@@ -10,7 +10,7 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -27,7 +27,7 @@ from .scene_copy import SceneText
 from .scene_files import number_text
 
 if TYPE_CHECKING:
-    from .preview import Canvas, Preview
+    from .preview import Canvas, Preview, Sight
 
 # While something moves, a picture should take about so long: eight a second. Its size grows and
 # shrinks by this factor where it takes much less or more.
@@ -152,6 +152,7 @@ class Viewfinder:
         self.advanced = 0.0  # when that was
         self.compiled = False
         self.stale = True  # whether the camera or the scene differ from what is shown
+        self.placed = self.known = False  # whether the preview has the camera, and the parameters
         self.canvas: Canvas | None = None  # the picture that refines
         self.shown, self.shown_at = 0, 0.0  # its passes when it was shown last, and when
         self.piece = FIRST_PIECE
@@ -216,13 +217,35 @@ class Viewfinder:
     # ---------------------------------------------------------------- what is seen
 
     def look(self) -> None:
-        """Place the sensor where the camera is."""
-        self.preview.look(self.pose.to_world(self.chart), **self.lens)
-        self.stale = True
+        """Have the sensor placed where the camera is."""
+        self.placed, self.stale = False, True
+
+    def change(self) -> None:
+        """Have the preview take over what has changed of the integrator or the media."""
+        self.known, self.stale = False, True
+
+    def _catch_up(self) -> None:
+        """Let the preview have the camera and the parameters that there are now.
+
+        Not before they are needed: what is dragged changes more often than there are pictures, and
+        a twist takes as long as one.
+        """
+        if not self.placed:
+            self.preview.look(self.pose.to_world(self.chart), **self.lens)
+            self.placed = True
+        if not self.known:
+            self.preview.change()
+            self.known = True
+
+    def sight(self, at: Sequence[float]) -> Sight:
+        """What is seen at a place, in parts of the picture."""
+        self._catch_up()
+        return self.preview.sight(*at)
 
     def glance(self) -> None:
         """Show a picture at once, as large as there is time for."""
         start = time.perf_counter()
+        self._catch_up()
         width, height = self._size(self.width)
         canvas = self.preview.canvas(width, height)
         self.nil.max_depth = MOVING_DEPTH if self.depth < 0 else min(MOVING_DEPTH, self.depth)
@@ -407,7 +430,7 @@ class Viewfinder:
     def _point(self) -> None:
         if self.pointed is not None:
             at, self.pointed = self.pointed, None
-            self._tell_sight(at, self.preview.sight(*at))
+            self._tell_sight(at, self.sight(at))
 
     def _tell_sight(self, at, sight) -> None:
         names = ("shape", "cell", "position", "distance")
@@ -416,7 +439,7 @@ class Viewfinder:
         )
 
     def _do_aim(self, message: dict) -> None:
-        sight = self.preview.sight(*message["at"])
+        sight = self.sight(message["at"])
         self.pose = self.pose.looking(self.chart.to_cell_axes(sight.direction))
         if sight.distance is not None and "focus" in self.sliders:
             self._set(self.sliders["focus"], sight.distance)
@@ -493,7 +516,7 @@ class Viewfinder:
         self.nil.twist = value
         self.chart = Chart.of(self.nil)
         self.pose = self.pose.within(self.chart)
-        self.preview.change()
+        self.change()
         self.look()
 
     def _exposure(self, value: float) -> None:
@@ -522,8 +545,7 @@ class Viewfinder:
 
     def _tolerance(self, value: float) -> None:
         self.nil.tolerance = value
-        self.preview.change()
-        self.stale = True
+        self.change()
 
     def _denoise(self, value: float) -> None:
         self.denoises = bool(value)
@@ -544,8 +566,7 @@ class Viewfinder:
             self._prepare()
         else:
             fog.thicken(self.fog_medium, self.nil)
-            self.preview.change()
-            self.stale = True
+            self.change()
 
     def _prepare(self) -> None:
         """Make anew what renders."""
@@ -553,8 +574,9 @@ class Viewfinder:
 
         self.compiled = False
         self.preview = Preview(self.scene, self.nil, self.sensor, self.guided)
-        self.look()
-        self.preview.change()
+        self.placed = self.known = False
+        self.stale = True
+        self._catch_up()
 
     def _has_media(self) -> bool:
         from .media import has_media  # of the current variant

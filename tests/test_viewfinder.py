@@ -139,18 +139,18 @@ def test_a_key_that_is_let_go_at_once_makes_a_step(look):
 
 def test_what_is_dragged_follows_the_hand(look):
     finder, _ = look()
-    at = finder.preview.sight(0.4, 0.45).direction
+    at = finder.sight((0.4, 0.45)).direction
     finder.answer({"do": "look", "by": [0.1 * 24 / 16, 0.05]})
-    moved = finder.preview.sight(0.5, 0.5).direction
+    moved = finder.sight((0.5, 0.5)).direction
     assert moved == pytest.approx(at, abs=0.02)
     assert finder.pose.left.z == pytest.approx(0, abs=1e-6)
 
 
 def test_what_is_aimed_at_is_in_the_middle_then_and_sharp(look):
     finder, window = look()
-    sight = finder.preview.sight(0.3, 0.4)
+    sight = finder.sight((0.3, 0.4))
     finder.answer({"do": "aim", "at": [0.3, 0.4]})
-    middle = finder.preview.sight(0.5, 0.5)
+    middle = finder.sight((0.5, 0.5))
     assert (middle.shape, middle.cell) == (sight.shape, sight.cell)
     assert middle.position == pytest.approx(sight.position, abs=1e-4)
     assert finder.lens["focus_distance"] == pytest.approx(sight.distance)
@@ -189,6 +189,33 @@ def test_in_plain_nil_the_twist_may_be_any_number(look):
     value(finder, "twist", 0.37)
     assert finder.nil.twist == 0.37 and finder.chart.twist == 0.37
     work(finder, 1)
+
+
+def test_what_is_dragged_costs_no_more_than_its_pictures(look, monkeypatch):
+    """A hand sends sixty values a second, and a twist takes as long as a picture."""
+    finder, window = look()
+    work(finder, 2)
+    calls = []
+    for name in ("look", "change"):
+        method = getattr(finder.preview, name)
+        monkeypatch.setattr(
+            finder.preview, name, lambda *a, f=method, n=name, **k: calls.append(n) or f(*a, **k)
+        )
+    for step in range(60):
+        value(finder, "twist", step % 3)
+        finder.answer({"do": "look", "by": [0.01, 0]})
+    assert calls == []
+    work(finder, 2)
+    assert sorted(calls) == ["change", "look"]
+
+
+def test_what_is_pointed_at_is_seen_from_where_the_camera_is_now(look):
+    finder, window = look()
+    work(finder, 2)
+    window.ready = False  # no picture is shown meanwhile
+    before = finder.sight((0.5, 0.5)).direction
+    finder.answer({"do": "look", "by": [0.5, 0]})
+    assert math.dist(finder.sight((0.5, 0.5)).direction, before) > 0.1
 
 
 def test_another_exposure_traces_nothing(look, monkeypatch):
