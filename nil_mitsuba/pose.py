@@ -13,8 +13,11 @@ import mitsuba as mi
 from . import geometry
 from .aiming import columns_of, up_of
 
-# Sine of the least angle between view and upright: beyond it a turn to the side is a roll
-STEEPEST = math.cos(math.radians(89))
+# How far a turn leads above the level (radians): beyond it one to the side is a roll
+STEEPEST = math.radians(89)
+
+# Steps that cancel each other, as up and back do at the zenith, leave no more than rounding
+STILL = 1e-6
 
 Vector: TypeAlias = Any  # ds.Array3f64
 
@@ -114,7 +117,10 @@ class Pose:
         geodesic's frame direction, about the fibres: whoever walks straight ahead looks ahead.
         """
         left, view = unit(self.left), unit(self.view)
-        towards = unit(to[0] * left + to[1] * self.upright + to[2] * view)
+        ahead = to[0] * left + to[1] * self.upright + to[2] * view
+        if math.hypot(*ahead) < STILL:
+            return self
+        towards = unit(ahead)
         place, _ = geometry.flow(self.place, towards, length, chart.twist)
         angle = chart.twist * towards.z * length
         left, up, view, upright = (
@@ -130,14 +136,10 @@ class Pose:
         mirrored = dot(cross(self.up, self.view), self.left) < 0
         pose = self._rotated(self.upright, -aside if mirrored else aside)
         view = unit(pose.view)
-        side = cross(pose.upright, view)
-        size = math.hypot(*side)
-        if size < STEEPEST:
-            return pose
-        height = math.atan2(dot(pose.upright, view), size)
-        most = math.acos(STEEPEST)
-        above = max(-most, min(most, height + above)) - height
-        return pose._rotated(-1 / size * side, above)
+        height = math.atan2(dot(pose.upright, view), math.hypot(*cross(pose.upright, view)))
+        above = max(-STEEPEST, min(STEEPEST, height + above)) - height
+        # About the camera's own side: where `looking` has led to the very zenith, no other is known
+        return pose._rotated(unit(cross(view, pose.up)), above)
 
     def looking(self, towards: Vector) -> Pose:
         """The pose that looks along a unit frame direction (cell axes), as upright as before.

@@ -6,7 +6,7 @@ import mitsuba as mi
 import pytest
 
 from nil_mitsuba import geometry
-from nil_mitsuba.pose import Chart, Pose
+from nil_mitsuba.pose import Chart, Pose, unit
 
 
 @pytest.fixture
@@ -70,6 +70,27 @@ def test_turns_keep_the_horizon_level_and_end_before_the_zenith(chart):
     zenith = pose.turned(0, 9.0)
     assert math.degrees(math.asin(zenith.view.z)) == pytest.approx(89)
     assert math.degrees(math.asin(zenith.turned(0, -9.0).view.z)) == pytest.approx(-89)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-9, 0.003])
+@pytest.mark.parametrize("scale", [[1, 1, 1], [-1, 1, 1]])
+def test_whoever_has_aimed_at_the_zenith_can_look_down_again(chart, off, scale):
+    start = Pose.of(camera() @ mi.Transform4f().scale(scale), chart)
+    ahead = unit(start.view)
+    zenith = start.looking(unit(chart.to_cell_axes([0, 1, 0]) + off * ahead))
+    assert zenith.view.z > 0.99999
+    down = zenith.turned(0, -1.0)
+    heights = [math.atan2(v.z, math.hypot(v.x, v.y)) for v in (down.view, zenith.view)]
+    assert heights[0] == pytest.approx(heights[1] - 1, abs=1e-3)
+    # To the side where it looked before it turned up
+    azimuths = [math.atan2(v.y, v.x) for v in (down.view, ahead)]
+    assert azimuths[0] == pytest.approx(azimuths[1], abs=1e-3)
+    assert down.left.z == pytest.approx(0, abs=1e-6)
+
+
+def test_steps_that_cancel_each_other_lead_nowhere(chart):
+    pose = Pose.of(camera(), chart).looking(chart.to_cell_axes([0, 1, 0]))
+    assert pose.moved((0, 1, -1), 0.3, chart) == pose
 
 
 @pytest.mark.parametrize("scale", [[1, 1, 1], [-1, 1, 1]])
