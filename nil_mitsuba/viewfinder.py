@@ -11,7 +11,7 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -354,8 +354,10 @@ class Viewfinder:
         self._do_size(message)
         self.move, self.turn = (0.0, 0.0, 0.0), (0.0, 0.0)
         self._tell_scene()
-        for sentence in self.notes:
-            self.say(sentence)
+        if self.notes:
+            self.say(" ".join(self.notes))  # there is room for one message
+        if self.keys:
+            self._tell_keys()
         if not self.compiled:
             self.say("Compiling the kernel of this scene.", "busy")
 
@@ -633,7 +635,7 @@ class Viewfinder:
     def _save(self) -> Copy:
         """A copy of the scene with this camera; that which there is already, if there is one."""
         state = self.pose.place, self.pose.view, self.pose.up, self._changed_lens()
-        if self.saved is None or self.saved[0] != state:
+        if self.saved is None or self.saved[0] != state or not self.saved[1].path.exists():
             copy = Copy(self._edit(self.text.save), self._edit(self.text.defines))
             self.saved = state, copy
         return self.saved[1]
@@ -656,16 +658,25 @@ class Viewfinder:
         if self.key_path is None:
             self.key_path = fresh_path(scene, "-keys", ".json")
         # A flight changes the parameters that its scene's sensor has: those of a lens need a copy
-        lens = {name: self.lens[name] for name in self.own_lens}
         if self.lens.get("aperture_radius", 0) > 0 and "aperture_radius" not in self.own_lens:
             self.key_copy = self.key_copy or self._save()
-        if self.key_copy:
-            lens = dict(self.lens)
         matrix = self.pose.to_world(self.chart).matrix
         entries = [float(matrix[i, j]) for i in range(4) for j in range(4)]
-        added = [*self.keys, keys.Key(entries, self.pose.cell, lens)]
-        keys.save(self.key_path, added)
+        added = [*self.keys, keys.Key(entries, self.pose.cell, dict(self.lens))]
+        # All anew: keys from before the copy are to have the lens that they were seen by, too
+        known = self.lens if self.key_copy else self.own_lens
+        keys.save(
+            self.key_path,
+            [
+                replace(key, parameters={name: key.parameters[name] for name in known})
+                for key in added
+            ],
+        )
         self.keys = added
+        self._tell_keys()
+
+    def _tell_keys(self) -> None:
+        scene = Path(self.job.path)
         flown = self.key_copy or Copy(scene, self.job.defines)
         words = ["nil-mitsuba", "fly", str(flown.path), *self._options(flown.defines)]
         words += ["--keys", str(self.key_path), "--frames", "120"]

@@ -3,6 +3,7 @@
 import json
 import math
 import shlex
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -349,6 +350,45 @@ def test_keys_are_collected_beside_the_scene(look, tmp_path):
     assert second.parameters == {"x_fov": pytest.approx(50)}
     words = shlex.split(told["command"])
     assert words[1:3] == ["fly", str(tmp_path / "scene.xml")] and "--keys" in words
+
+
+def test_keys_keep_the_lens_that_they_were_seen_by(look, tmp_path):
+    """The flight is one of a copy with a lens as soon as one of the keys needs it."""
+    finder, window = look()
+    finder.answer({"do": "key"})
+    finder.answer({"do": "set", "name": "aperture", "value": 0.05})
+    finder.answer({"do": "key"})
+    finder.answer({"do": "set", "name": "aperture", "value": 0})
+    finder.answer({"do": "key"})
+    told = window.told("keys")[-1]
+    assert shlex.split(told["command"])[2] == str(tmp_path / "scene-view.xml")
+    apertures = [key.parameters["aperture_radius"] for key in keys.load(told["path"])]
+    assert apertures == [0, pytest.approx(0.05), 0]
+
+
+def test_whoever_loads_the_page_again_has_his_keys(look):
+    finder, window = look()
+    finder.answer({"do": "key"})
+    finder.answer({"do": "bye"})
+    finder.answer({"do": "hello", "size": [48, 32]})
+    first, again = window.told("keys")
+    assert first == again
+
+
+def test_all_notes_on_a_scene_are_in_one_message(look):
+    finder, window = look()
+    finder.notes = ["One thing.", "Another."]
+    finder.answer({"do": "hello", "size": [48, 32]})
+    assert window.told("says")[-2]["text"] == "One thing. Another."
+
+
+def test_a_copy_that_was_removed_is_written_again(look):
+    finder, window = look()
+    finder.answer({"do": "save"})
+    path = Path(window.told("saved")[-1]["path"])
+    path.unlink()
+    finder.answer({"do": "render"})
+    assert Path(window.told("command")[-1]["path"]).exists()
 
 
 def test_what_goes_wrong_is_said_once_and_the_walk_goes_on(look, monkeypatch):
