@@ -25,6 +25,7 @@ from .pose import Chart, Pose
 from .registration import WORKING_VARIANT
 from .scene_copy import SceneText
 from .scene_files import number_text
+from .stills import film_settings
 
 if TYPE_CHECKING:
     from .preview import Canvas, Preview, Sight
@@ -130,6 +131,8 @@ class Viewfinder:
         self.sensor, self.lens = viewing_sensor(own, self.nil)
         self.text = SceneText(self.job.path, self.job.defines)
         self.own_lens = lens_of(own)
+        self.film_format = film_settings(own.film())["pixel_format"]
+        self.in_passes = hasattr(opened.integrator, "view")  # what wraps it knows none
         self.depth = self.nil.max_depth
         self.chart = Chart.of(self.nil)
         self.home = self.pose = Pose.of(own.world_transform(), self.chart)
@@ -646,11 +649,20 @@ class Viewfinder:
     def _do_render(self, _message: dict) -> None:
         copy = self._save()
         words = ["nil-mitsuba", "render", str(copy.path), *self._options(copy.defines)]
-        words += ["--png", str(copy.path.with_suffix(".png"))]
+        words += self._looks(copy)
+        self.link.send({"is": "command", "command": shlex.join(words), "path": str(copy.path)})
+
+    def _looks(self, copy: Copy) -> list[str]:
+        """The options that make of the still what is shown, as far as its film can tell it."""
+        if not self.film_format:
+            return []
+        words = ["--png", str(copy.path.with_suffix(".png"))]
         if self.exposure:
             words += ["--exposure", number_text(self.exposure)]
-        words += ["--filmic"] * self.filmic + ["--denoise"] * self.denoises
-        self.link.send({"is": "command", "command": shlex.join(words), "path": str(copy.path)})
+        words += ["--filmic"] * self.filmic
+        if self.denoises and self.in_passes and self.film_format in ("rgb", "rgba"):
+            words.append("--denoise")
+        return words
 
     def _do_key(self, _message: dict) -> None:
         """Add the camera to those by which a flight leads, in a file beside the scene."""

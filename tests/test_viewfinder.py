@@ -3,6 +3,7 @@
 import json
 import math
 import shlex
+import sys
 from pathlib import Path
 
 import drjit as dr
@@ -335,6 +336,33 @@ def test_the_command_that_is_shown_renders_what_was_shown(look, command, tmp_pat
     for c in range(3):
         shown = dr.mean(finder.picture[:, :, c].array)[0]
         assert dr.mean(still[:, :, c].array)[0] == pytest.approx(shown, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "looks"),
+    [
+        ("<film", "<film", ["--png", "--denoise"]),
+        ("<rfilter", '<string name="pixel_format" value="luminance"/><rfilter', ["--png"]),
+        ("<integrator ", '<integrator type="moment"><integrator ', ["--png"]),
+        ('type="hdrfilm"', 'type="specfilm"', []),
+    ],
+)
+def test_the_command_asks_for_what_the_still_can_be(look, command, monkeypatch, old, new, looks):
+    special = "specfilm" in new
+    text = SCENE.replace(old, new)
+    if "moment" in new:
+        text = text.replace("</integrator>", "</integrator></integrator>")
+    if special:
+        text = text.replace("<rfilter", '<spectrum name="band" value="400:0,550:1,700:0"/><rfilter')
+    monkeypatch.setattr(sys.modules[__name__], "SCENE", text)
+    job = {"variant": "llvm_ad_spectral"} if special else {}
+    finder, window = look(defines={"spp": "2"}, **job)
+    finder.denoises = True
+    finder.answer({"do": "render"})
+    words = shlex.split(window.told("command")[-1]["command"])
+    assert [word for word in words if word in ("--png", "--denoise")] == looks
+    status, _, err = command(*(word for word in words[1:] if word != "--denoise"))
+    assert status == 0, err
 
 
 def test_keys_are_collected_beside_the_scene(look, tmp_path):
