@@ -248,6 +248,63 @@ def test_another_size_of_the_page_keeps_what_is_seen(look):
     assert window.frames[-1][0]["size"] == [96, 64]
 
 
+def test_a_picture_that_could_not_be_shown_is_shown_later(look):
+    finder, window = look()
+    work(finder, 2)
+    window.ready = False
+    value(finder, "exposure", 2)
+    window.ready = True
+    shown = len(window.frames)
+    finder._work()
+    assert len(window.frames) == shown + 1
+    assert window.frames[-1][0]["spp"] == window.frames[-2][0]["spp"]
+
+
+def test_moving_pictures_are_as_large_as_there_is_time_for(look):
+    finder, _ = look()
+    finder.answer({"do": "size", "size": [2000, 2000]})
+    for _ in range(20):
+        finder._adapt(1.0)
+    assert finder.width == viewfinder.SMALLEST
+    for _ in range(40):
+        finder._adapt(0.01)
+    assert finder.width > 1000
+
+
+def test_the_size_of_moving_pictures_follows_their_time(look, monkeypatch):
+    finder, _ = look()
+    taken = []
+    monkeypatch.setattr(finder, "_adapt", taken.append)
+    for _ in range(3):
+        finder.answer({"do": "home"})
+        work(finder, 1)
+    assert len(taken) == 2 and min(taken) > 0  # that which compiles the kernel tells nothing
+
+
+def test_paths_are_short_only_while_something_moves(look, monkeypatch):
+    finder, _ = look()
+    value(finder, "depth", 20)
+    render, depths = finder.preview.render, []
+
+    def watched(*arguments):
+        depths.append(finder.nil.max_depth)
+        render(*arguments)
+
+    monkeypatch.setattr(finder.preview, "render", watched)
+    work(finder, 2)
+    assert depths[0] == viewfinder.MOVING_DEPTH and set(depths[1:]) == {20}
+
+
+def test_however_long_a_picture_takes_the_next_is_near(look, monkeypatch):
+    finder, window = look()
+    steps = []
+    monkeypatch.setattr(finder, "_advance", steps.append)
+    monkeypatch.setattr(finder, "_work", lambda: None)
+    ended = iter((False, True))
+    finder.run(lambda: next(ended))  # long after it was made
+    assert steps == [viewfinder.LONGEST_STEP]
+
+
 def test_fog_takes_light_away_and_can_be_cleared(look):
     finder, window = look()
     work(finder, 2)
