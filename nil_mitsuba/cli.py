@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib.util
 import json
 import math
 import os
@@ -26,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import __version__, aiming, checkpoint, exr, jobs, keys, png, stills
+from .denoise import can_denoise
 from .errors import cause_of
 from .fitting import FITS, cut_off
 from .fog import ALBEDO, MOST, Fog
@@ -1268,7 +1268,7 @@ def _scene_path(name: str) -> Path:
 
 
 def _require_denoiser() -> None:
-    if importlib.util.find_spec("mitsuba_oidn") is None:
+    if not can_denoise():
         raise click.ClickException(
             "--denoise needs the package mitsuba-oidn: pip install 'nil-mitsuba[denoise]'"
         )

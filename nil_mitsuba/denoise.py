@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import drjit as dr
 import mitsuba as mi
 
@@ -59,6 +61,11 @@ def through_media(
     """
     seen = (transmittance[:, :, :1] + transmittance[:, :, 1:2] + transmittance[:, :, 2:]) / 3
     return 1 + (albedo - 1) * transmittance, normal * seen
+
+
+def can_denoise() -> bool:
+    """Whether the denoiser is installed."""
+    return importlib.util.find_spec("mitsuba_oidn") is not None
 
 
 def _oidn():

@@ -85,7 +85,7 @@ class SceneText:
         cannot be written.
         """
         text = self._with(sensor, to_world, Lens(**lens)).decode("utf-8", "surrogateescape")
-        path = _claim(self.path)
+        path = claim(self.path, "-view", self.path.suffix)
         try:
             with replacing(path) as part:
                 Path(part).write_bytes(text.encode(self._codec, "surrogateescape"))
@@ -389,16 +389,17 @@ def _replaced(text: bytes, element: _Element, edits: list[tuple[int, int, bytes]
     return b"".join([*parts, text[at : element.end]])
 
 
-def _claim(path: Path) -> Path:
-    """An empty file beside a scene, of a name that nothing had."""
+def claim(scene: Path, ending: str, suffix: str) -> Path:
+    """An empty file beside a scene, of a name that nothing had: "scene" and the ending, numbered
+    from the second on. Raises OSError with a sentence."""
     number = 1
     while True:
-        copy = path.with_name(f"{path.stem}-view{f'-{number}' if number > 1 else ''}{path.suffix}")
+        path = scene.with_name(f"{scene.stem}{ending}{f'-{number}' if number > 1 else ''}{suffix}")
         try:
-            copy.open("xb").close()
+            path.open("xb").close()
         except FileExistsError:
             number += 1
         except OSError as error:
-            raise OSError(f'cannot write "{copy}": {error.strerror}.') from error
+            raise OSError(f'cannot write "{path}": {error.strerror}.') from error
         else:
-            return copy
+            return path

@@ -7,25 +7,22 @@ described there. Everything runs in one thread.
 from __future__ import annotations
 
 import math
-import os
-import shlex
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-import drjit as dr
 import mitsuba as mi
 
-from . import jobs, keys
+from . import jobs
+from .denoise import can_denoise
 from .errors import cause_of
-from .fog import ALBEDO, Fog
+from .fog import Fog
+from .keeping import Keeper, Shot
+from .lens import viewing_sensor
 from .pose import Chart, Pose
-from .registration import WORKING_VARIANT
-from .scene_copy import SceneText
 from .scene_files import number_text
-from .stills import film_settings
 
 if TYPE_CHECKING:
     from .preview import Canvas, Preview, Sight
@@ -47,7 +44,8 @@ FIRST_PIECE, LEAST_PIECE = 2**15, 2**12
 # The denoiser's better network takes three times as long: it has to be worth it.
 FEW_PASSES = 16
 
-# A picture that refines is shown whenever it has twice as many samples, but at least so often.
+# A picture that refines is shown whenever it has twice as many samples, and after each pass by
+# when so many seconds have gone.
 SHOW_SECONDS = 5.0
 
 # However long a picture takes, the next one is no farther away than so many seconds of walking.
@@ -60,9 +58,6 @@ WAIT_SECONDS = 0.2  # for messages, if there is nothing to do; signals are looke
 
 # A page that is loaded again is back within so many seconds; then it was closed.
 LEAVING_SECONDS = 3.0
-
-
-LENS = ("x_fov", "focus_distance", "aperture_radius")
 
 
 class Link(Protocol):
@@ -129,10 +124,7 @@ class Viewfinder:
         self.notes, self.link = notes, link
         own = self.scene.sensors()[self.job.sensor]
         self.sensor, self.lens = viewing_sensor(own, self.nil)
-        self.text = SceneText(self.job.path, self.job.defines)
-        self.own_lens = lens_of(own)
-        self.film_format = film_settings(own.film())["pixel_format"]
-        self.in_passes = hasattr(opened.integrator, "view")  # what wraps it knows none
+        self.keeper = Keeper(opened)
         self.depth = self.nil.max_depth
         self.chart = Chart.of(self.nil)
         self.home = self.pose = Pose.of(own.world_transform(), self.chart)
@@ -166,10 +158,6 @@ class Viewfinder:
         self.header: dict = {}
         self.untold = False  # whether it could not be shown
         self.pointed: list[float] | None = None
-        self.keys: list[keys.Key] = []
-        self.key_path: Path | None = None
-        self.key_copy: Copy | None = None  # which they need, if the scene's own sensor has no lens
-        self.saved: tuple[tuple, Copy] | None = None  # the last copy, and what it holds
         self._prepare()
 
     # ------------------------------------------------------------------ the loop
@@ -359,8 +347,8 @@ class Viewfinder:
         self._tell_scene()
         if self.notes:
             self.say(" ".join(self.notes))  # there is room for one message
-        if self.keys:
-            self._tell_keys()
+        if self.keeper.keys:
+            self.link.send(self.keeper.flight(self.shot))
         if not self.compiled:
             self.say("Compiling the kernel of this scene.", "busy")
 
@@ -408,7 +396,8 @@ class Viewfinder:
         if any(self.turn):
             self.pose = self.pose.turned(*(TURN * seconds * c for c in self.turn))
         if any(self.move):
-            length = self.speed * seconds * math.hypot(*self.move)
+            # Two keys at once are no faster than one
+            length = self.speed * seconds * min(1, math.hypot(*self.move))
             self.pose = self.pose.moved(self.move, length, self.chart)
         if self.moving:
             self.kick = False
@@ -444,6 +433,10 @@ class Viewfinder:
         )
 
     def _do_aim(self, message: dict) -> None:
+        if self.sensor.class_name() == "OrthographicCamera":
+            raise ValueError(
+                "an orthographic camera sees all in one direction, and aims at nothing."
+            )
         sight = self.sight(message["at"])
         self.pose = self.pose.looking(self.chart.to_cell_axes(sight.direction))
         if sight.distance is not None and "focus" in self.sliders:
@@ -595,194 +588,32 @@ class Viewfinder:
 
     # ------------------------------------------------------------------ what is kept
 
-    def _changed_lens(self) -> dict[str, float]:
-        """The lens's parameters that a scene file has to have other than it has them."""
-        lens = dict(self.lens)
-        if self.lens.get("aperture_radius") == 0:
-            del lens["focus_distance"]  # a pinhole has none
-        return {
-            name: value
-            for name, value in lens.items()
-            if value != self.own_lens.get(name, 0.0 if name == "aperture_radius" else None)
-        }
-
-    def _options(self, defines: dict[str, str]) -> list[str]:
-        """The command's options that say which scene it is, and in which space."""
-        words = [] if self.job.variant == WORKING_VARIANT else ["-m", self.job.variant]
-        words += [word for item in defines.items() for word in ("-D", "=".join(item))]
-        words += ["-s", str(self.job.sensor)] if self.job.sensor else []
-        properties = {**self.job.properties}
-        properties.pop("aovs", None)
+    @property
+    def shot(self) -> Shot:
+        """What there is to see now, as it can be kept."""
         now = {"twist": self.nil.twist, "tolerance": self.nil.tolerance, "max_depth": self.depth}
-        properties |= {
+        properties = {
             name: number_text(value) for name, value in now.items() if value != self.first[name]
         }
-        words += [word for item in properties.items() for word in ("-P", "=".join(item))]
-        if self.fog:
-            words += ["--fog", number_text(self.fog)]
-            if self.fog_albedo != ALBEDO:
-                words += ["--fog-albedo", number_text(self.fog_albedo)]
-        return words
-
-    def _edit(self, edit: Callable):
-        """A method of the scene's text, for the camera that there is now."""
-        changed = self._changed_lens()
-        lens = {name: changed.get(name) for name in LENS}
-        return edit(self.job.sensor, self.pose.to_world(self.chart), **lens)
+        return Shot(
+            self.pose,
+            self.chart,
+            dict(self.lens),
+            properties,
+            Fog(self.fog, self.fog_albedo),
+            self.exposure,
+            self.filmic,
+            self.denoises,
+        )
 
     def _do_copy(self, _message: dict) -> None:
-        options = self._options(self._edit(self.text.defines))
-        xml = self._edit(self.text.camera)
-        self.link.send({"is": "camera", "xml": xml, "options": shlex.join(options)})
-
-    def _save(self) -> Copy:
-        """A copy of the scene with this camera; that which there is already, if there is one."""
-        state = self.pose.place, self.pose.view, self.pose.up, self._changed_lens()
-        if self.saved is None or self.saved[0] != state or not self.saved[1].path.exists():
-            copy = Copy(self._edit(self.text.save), self._edit(self.text.defines))
-            self.saved = state, copy
-        return self.saved[1]
+        self.link.send(self.keeper.camera(self.shot))
 
     def _do_save(self, _message: dict) -> None:
-        self.link.send({"is": "saved", "path": str(self._save().path)})
+        self.link.send(self.keeper.save(self.shot))
 
     def _do_render(self, _message: dict) -> None:
-        copy = self._save()
-        words = ["nil-mitsuba", "render", str(copy.path), *self._options(copy.defines)]
-        words += self._looks(copy)
-        self.link.send({"is": "command", "command": shlex.join(words), "path": str(copy.path)})
-
-    def _looks(self, copy: Copy) -> list[str]:
-        """The options that make of the still what is shown, as far as its film can tell it."""
-        if not self.film_format:
-            return []
-        words = ["--png", str(copy.path.with_suffix(".png"))]
-        if self.exposure:
-            words += ["--exposure", number_text(self.exposure)]
-        words += ["--filmic"] * self.filmic
-        if self.denoises and self.in_passes and self.film_format in ("rgb", "rgba"):
-            words.append("--denoise")
-        return words
+        self.link.send(self.keeper.command(self.shot))
 
     def _do_key(self, _message: dict) -> None:
-        """Add the camera to those by which a flight leads, in a file beside the scene."""
-        scene = Path(self.job.path)
-        if self.key_path is None:
-            self.key_path = fresh_path(scene, "-keys", ".json")
-        # A flight changes the parameters that its scene's sensor has: those of a lens need a copy
-        if self.lens.get("aperture_radius", 0) > 0 and "aperture_radius" not in self.own_lens:
-            self.key_copy = self.key_copy or self._save()
-        matrix = self.pose.to_world(self.chart).matrix
-        entries = [float(matrix[i, j]) for i in range(4) for j in range(4)]
-        added = [*self.keys, keys.Key(entries, self.pose.cell, dict(self.lens))]
-        # All anew: keys from before the copy are to have the lens that they were seen by, too
-        known = self.lens if self.key_copy else self.own_lens
-        keys.save(
-            self.key_path,
-            [
-                replace(key, parameters={name: key.parameters[name] for name in known})
-                for key in added
-            ],
-        )
-        self.keys = added
-        self._tell_keys()
-
-    def _tell_keys(self) -> None:
-        scene = Path(self.job.path)
-        flown = self.key_copy or Copy(scene, self.job.defines)
-        words = ["nil-mitsuba", "fly", str(flown.path), *self._options(flown.defines)]
-        words += ["--keys", str(self.key_path), "--frames", "120"]
-        words += ["-o", str(scene.with_name(f"{scene.stem}-frames"))]
-        self.link.send(
-            {
-                "is": "keys",
-                "count": len(self.keys),
-                "path": str(self.key_path),
-                "command": shlex.join(words),
-            }
-        )
-
-
-@dataclass(frozen=True)
-class Copy:
-    """A scene file with a camera that was found here, and the constants that it refers to."""
-
-    path: Path
-    defines: dict[str, str]
-
-
-def lens_of(sensor: mi.Sensor) -> dict[str, float]:
-    """The parameters of a sensor that a lens may change."""
-    parameters = mi.traverse(sensor)
-    return {name: float(_one(parameters[name])) for name in LENS if name in parameters}
-
-
-def viewing_sensor(own: mi.Sensor, nil: mi.Integrator) -> tuple[mi.Sensor, dict[str, float]]:
-    """A sensor that sees what a scene's own sees, and its lens's parameters.
-
-    A pinhole becomes a lens with an aperture of nothing, so that an aperture needs no other kernel.
-    Raises RuntimeError for a sensor that cannot be moved.
-    """
-    parameters = mi.traverse(own)
-    kind = own.class_name()
-    if kind in ("BatchSensor", "RadianceMeter") or "to_world" not in parameters:
-        raise RuntimeError(
-            f'the viewfinder cannot walk with the sensor "{kind}": name another by -s, or look '
-            "through a copy of the scene with a perspective one."
-        )
-    lens = lens_of(own)
-    shifted = any(
-        _one(parameters[name])
-        for name in ("principal_point_offset_x", "principal_point_offset_y")
-        if name in parameters
-    )
-    if kind != "PerspectiveCamera" or shifted:
-        return own, lens
-    film = own.film()
-    (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
-    crop_x, crop_y = film.crop_offset()
-    lens |= {"focus_distance": 2.0 * nil.cell_size, "aperture_radius": 0.0}
-    description = {
-        "type": "thinlens",
-        "fov": lens["x_fov"],
-        "fov_axis": "x",
-        "focus_distance": lens["focus_distance"],
-        "aperture_radius": 1.0,  # of 0 Mitsuba would warn
-        "near_clip": own.near_clip(),
-        "far_clip": own.far_clip(),
-        "shutter_open": own.shutter_open(),
-        "shutter_close": own.shutter_open() + own.shutter_open_time(),
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "crop_width": crop_width,
-            "crop_height": crop_height,
-            "crop_offset_x": crop_x,
-            "crop_offset_y": crop_y,
-        },
-    }
-    if own.get_medium() is not None:
-        description["medium"] = own.get_medium()
-    return mi.load_dict(description), lens
-
-
-def can_denoise() -> bool:
-    """Whether the denoiser is installed."""
-    import importlib.util
-
-    return importlib.util.find_spec("mitsuba_oidn") is not None
-
-
-def fresh_path(scene: Path, ending: str, suffix: str) -> Path:
-    """A name beside a scene that no file has."""
-    number = 1
-    while True:
-        path = scene.with_name(f"{scene.stem}{ending}{'' if number == 1 else f'-{number}'}{suffix}")
-        if not os.path.lexists(path):
-            return path
-        number += 1
-
-
-def _one(value) -> float:
-    return value[0] if dr.is_array_v(value) else value
+        self.link.send(self.keeper.add_key(self.shot))

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from nil_mitsuba import geometry, look_at, viewfinder
+from nil_mitsuba import geometry, lens, look_at
 from nil_mitsuba.layers import GUIDES
 from small_stills import description
 
@@ -19,9 +19,9 @@ def preview_of(scene, guided=False, own=False):
 
     nil, sensor = scene.integrator(), scene.sensors()[0]
     to_world = sensor.world_transform()
-    sensor, lens = (sensor, {}) if own else viewfinder.viewing_sensor(sensor, nil)
+    sensor, parameters = (sensor, {}) if own else lens.viewing_sensor(sensor, nil)
     preview = Preview(scene, nil, sensor, guided)
-    preview.look(to_world, **lens)
+    preview.look(to_world, **parameters)
     preview.change()
     return preview
 
@@ -101,8 +101,8 @@ def test_nothing_that_is_dragged_compiles_a_kernel(rgb, quotient):
         for name, value in changes:
             setattr(nil, name, value)
             change()
-        for lens in ({"x_fov": 20.0}, {"aperture_radius": 0.1}, {"focus_distance": 0.3}):
-            preview.look(mi.ScalarTransform4f().translate([0.3, 0.2, 0.1]), **lens)
+        for changed in ({"x_fov": 20.0}, {"aperture_radius": 0.1}, {"focus_distance": 0.3}):
+            preview.look(mi.ScalarTransform4f().translate([0.3, 0.2, 0.1]), **changed)
             rendered(preview)
         for size in ((4, 3), (33, 20), (200, 100)):
             rendered(preview, size=size)
@@ -178,4 +178,4 @@ def test_a_sensor_that_cannot_walk_is_refused(rgb, kind):
     inner = {"inner": {"type": "perspective"}} if kind == "batch" else {}
     sensor = mi.load_dict({"type": kind, "film": film} | inner)
     with pytest.raises(RuntimeError, match="cannot walk.*-s"):
-        viewfinder.viewing_sensor(sensor, mi.load_dict({"type": "nil"}))
+        lens.viewing_sensor(sensor, mi.load_dict({"type": "nil"}))

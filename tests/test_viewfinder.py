@@ -318,7 +318,7 @@ def test_fog_takes_light_away_and_can_be_cleared(look):
     work(finder, 4)
     assert foggy < 0.8 * clear
     assert dr.mean(finder.picture.array)[0] == pytest.approx(clear, rel=0.1)
-    assert "--fog" not in finder._options({})
+    assert "--fog" not in finder.keeper.options(finder.shot, {})
 
 
 def options_of(finder):
@@ -528,4 +528,4 @@ def test_other_sensors_walk_without_a_lens(look, kind):
 def test_a_depth_of_64_is_no_limit(look):
     finder, _ = look()
     value(finder, "depth", 64)
-    assert finder.nil.max_depth == -1 and "max_depth=-1" in finder._options({})
+    assert finder.nil.max_depth == -1 and "max_depth=-1" in finder.keeper.options(finder.shot, {})
