@@ -340,6 +340,29 @@ class Tracer:
         """The length h of a chord, of which the first one has the part ``unit`` only."""
         return dr.select(front.t == 0, larger(unit * h, self.least), h)
 
+    def _balanced(self, front, chord, foot, part, face, lift, off, wanted):
+        """A chord that a face cuts, turned so that its piece before that is right in the mean.
+
+        The next one begins there, at a phase that is not random any more. Vertices are ``off`` the
+        curve by parts of the acceleration: at its end the whole chord by ``lift``, the piece of the
+        length u by −u²/6 less what it is off at its start. The end is moved along the face. Returns
+        the chord, its part in this cell, and what its end there is off.
+        """
+        u = part * chord.length
+        there = dr.fma(part, lift - off, off) + 0.5 * u * (chord.length - u)
+        goal = -dr.square(u) / 6 - off
+        acceleration, across = self.acceleration(foot), dr.abs(mi.Vector3f(face))
+        rise = goal - there
+        slide = rise * dr.dot(across, acceleration) / dr.dot(across, chord.along)
+        less = part - slide
+        end = dr.fma(rise, acceleration, dr.fma(less, chord.along, front.vertex))
+        # Not where it would leave through another face, or go far along a curve that grazes this
+        good = wanted & (part < 1) & (dr.abs(slide) < 0.25 * part)
+        good &= dr.all((end >= 0) & (end <= mi.Point3f(self.space.periods)))
+        along = dr.select(good, mi.Vector3f((end - front.vertex) / less), chord.along)
+        off = dr.select(good, goal, there)
+        return Chord(along, chord.length), dr.select(good, less, part), off
+
     def _passed(self, chord, found, before):
         """Arc length from a chord's start to what its ray has found."""
         s = dr.fma(found.t, self.space.cells_per_unit, -before)
@@ -443,6 +466,8 @@ class Tracer:
         chord = Chord(mi.Vector3f(0), mi.Float(0))
         found = dr.zeros(mi.PreliminaryIntersection3f)
         active = active & (reach > 0)
+        bends_at_faces = quotient and not space.flat
+        off = mi.Float(0)  # of the vertex, from the curve, by what part of the acceleration
 
         # After a failed refinement chords are no longer than ``cap``
         cap = mi.Float(dr.inf)
@@ -473,6 +498,10 @@ class Tracer:
                 length = smaller(length, reach - front.t)
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
+                if dr.hint(bends_at_faces, mode="scalar"):
+                    chord, part, off = self._balanced(
+                        front, chord, foot, part, face, lift, off, cone.soft
+                    )
                 if dr.hint(leaps is not None, mode="scalar"):
                     part, face = dr.select(leaps, 1, part), dr.select(leaps, 0, face)
                 # Pieces overlap by the rounding of their joint, but none reaches behind the start
@@ -668,6 +697,8 @@ class Tracer:
         unit = random_of(p, v)
         front = self._start(start, p, v)
         blocked = mi.Bool(False)
+        bends_at_faces = quotient and not space.flat
+        off = mi.Float(0)  # as in `_along_chords`
         active = active & (reach > 0)
         found, met = dr.zeros(mi.PreliminaryIntersection3f), dr.zeros(mi.Ray3f)
 
@@ -686,6 +717,10 @@ class Tracer:
                 lift = dr.select(last, 0, corner(smaller(h, STEEPEST * rest)))
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
+                if dr.hint(bends_at_faces, mode="scalar"):
+                    chord, part, off = self._balanced(
+                        front, chord, foot, part, face, lift, off, True
+                    )
                 last &= part >= 1
                 s = part * chord.length
                 before = dr.select(front.t > 0, self.overlap, 0)
