@@ -26,8 +26,10 @@ VARIANT_MODULES = (
     "nil_mitsuba.volumetric",
     "nil_mitsuba.passes",
     "nil_mitsuba.integrator",
-    "nil_mitsuba.preview",
 )
+
+# Loaded by those who need it, and then anew with each variant.
+PREVIEW_MODULE = "nil_mitsuba.preview"
 
 # The sensors are for any integrator, and so for the variants, too, that cannot run "nil".
 SENSORS_MODULE = "nil_mitsuba.sensors"
@@ -80,6 +82,8 @@ def _register(_old: str | None, variant: str) -> None:
     else:
         for name in VARIANT_MODULES:
             _loaded(name)
+        if PREVIEW_MODULE in sys.modules:
+            _loaded(PREVIEW_MODULE)
 
         def construct(props):
             return sys.modules["nil_mitsuba.integrator"].NilIntegrator(props)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import pytest
 
 from conftest import ENVIRONMENT
-from nil_mitsuba import look_at
+from nil_mitsuba import keys, look_at
 from nil_mitsuba.fog import Fog
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -116,7 +116,7 @@ def test_the_readme_is_short_and_shows_code_of_each_kind():
 
 
 def test_no_block_is_of_a_language_that_nothing_runs():
-    assert {language for language, _ in BLOCKS} <= {"sh", "xml", "python", "text", "bibtex"}
+    assert {language for language, _ in BLOCKS} <= {"sh", "xml", "python", "json", "text", "bibtex"}
 
 
 @pytest.mark.parametrize("page", HOUSE, ids=lambda page: page.name)
@@ -148,6 +148,13 @@ def test_the_lines_of_air_are_those_of_fog(rgb):
 @pytest.mark.parametrize("text", blocks("xml"))
 def test_xml_is_whole(text):
     ElementTree.fromstring(text)
+
+
+@pytest.mark.parametrize("text", blocks("json"))
+def test_json_is_a_key_file(text, tmp_path):
+    path = tmp_path / "keys.json"
+    path.write_text(text)
+    assert keys.load(path)
 
 
 @pytest.mark.parametrize("text", blocks("python"))
