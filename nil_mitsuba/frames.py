@@ -15,7 +15,8 @@ import mitsuba as mi
 from . import exr_header, png
 from .checkpoint import Checkpoint, differences
 from .flight import Flight
-from .keys import PARAMETERS, Key, UnfitError
+from .keys import Key, UnfitError
+from .lens import lens_of
 from .pose import Chart, Pose
 from .stills import Progress, Rules, Still
 
@@ -56,8 +57,7 @@ class Frames:
                 f"a flight moves a sensor by its to_world, and the sensor {opened.job.sensor} "
                 f"{what}: fly with a copy of the scene with another."
             )
-        own = {name: self.sensor[name][0] for name in PARAMETERS if name in self.sensor}
-        self.flight = Flight(plan.keys, plan.count, self.chart, own)
+        self.flight = Flight(plan.keys, plan.count, self.chart, lens_of(sensor))
         for number, stop in enumerate(self.flight.stops, start=1):
             try:
                 self._move(stop.pose, stop.parameters)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-# As `mi.traverse` names them
-LENS = ("x_fov", "focus_distance", "aperture_radius")
+from .keys import PARAMETERS
+
+LENS = tuple(PARAMETERS)  # what keys may set
 
 
 def lens_of(sensor: mi.Sensor) -> dict[str, float]:

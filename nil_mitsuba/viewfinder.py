@@ -326,7 +326,6 @@ class Viewfinder:
             "frame": self.frames,
             "size": [width, height],
             "fps": 1 / self.seconds,
-            "noise": None,
             "speed": self.speed * self.chart.size,
         }
         if not self.link.show(header, as_jpeg(self.picture, self.exposure, self.filmic)):

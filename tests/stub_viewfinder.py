@@ -144,7 +144,6 @@ class Engine:
             "spp": 64,
             "moving": False,
             "fps": 9.5,
-            "noise": 0.021,
             "place": [0.12, -0.5, 0.75],
             "cell": [0, -1, 2],
             "speed": 0.5,

@@ -183,15 +183,15 @@ def test_a_scene_turned_along_with_its_fibres_gives_the_same_picture(rgb, fibres
         "quotient": quotient,
         "twist": 2.0 if quotient else 1.3,
         "hide_emitters": sensor == "lens",
+        # The phase of chords follows from a ray's bits, and so from how numbers were rounded: short
+        # ones, so that little depends on it
+        "tolerance": 0.005,
     }
     still, moved = photograph("z", sensor, **nil), photograph(fibres, sensor, **nil)
     for first in (4, 7):  # behind three colours and the distance: positions and normals
         vector = slice(first, first + 3)
         moved[vector] = turned_back(fibres, moved[vector])
-    # Where rounding decides what a later ray meets, since the phase of its chords follows from its
-    # bits: in up to 6 %, through the lens in the quotient 14 % of the pixels.
-    limit = 0.2 if sensor == "lens" and quotient else 0.08
-    assert max(unlike(a, b, 0.01) for a, b in zip(still[:3], moved[:3])) < limit
+    assert max(unlike(a, b, 0.01) for a, b in zip(still[:3], moved[:3])) < 0.01
     assert max(unlike(a, b, 1e-3) for a, b in zip(still[3:], moved[3:])) < 0.01
 
 
