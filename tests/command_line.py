@@ -27,7 +27,9 @@ LAMP = """
 """
 NIL = '<integrator type="nil"><float name="max_distance" value="1"/></integrator>'  # one lamp
 DEFAULTS = '<default name="spp" value="4"/><default name="format" value="float16"/>'
-BOX = SENSOR.replace("</film>", '<rfilter type="box"/></film>').replace("$format", "float32")
+# Two renders are equal to the bit only with a box filter: else threads add to the same pixels
+REPEATABLE = SENSOR.replace("</film>", '<rfilter type="box"/></film>')
+BOX = REPEATABLE.replace("$format", "float32")
 BALL = """
     <shape type="sphere" id="ball">
         <point name="center" x="0.3" y="0.5" z="0.6"/><float name="radius" value="0.1"/>

@@ -24,7 +24,8 @@ from command_line import (
 from nil_mitsuba import exr, stills
 
 
-def test_the_file_holds_what_the_integrator_renders(command):
+def test_the_file_holds_what_the_integrator_renders(command, folder):
+    (folder / "scene.xml").write_text(scene(NIL, SENSOR, LAMP))
     status, out, err = command("render", "scene.xml", "-D", "format=float32", "--seed", "3")
     assert (status, out) == (0, "scene.exr\n"), err
     _, types, pixels = read("scene.exr")
