@@ -44,9 +44,6 @@ START = 0.4
 CORNER, STEEPEST = 2 / 3, 4
 # Leaps are worth it down to this part of a chord: each takes 8 to 12 ns, where a query takes 50.
 LEAST_LEAP = 0.25
-# A packet of rays that are seen is of one pixel or of a few. Up to this distance (cells) they are
-# traced faster as rays that go the same way, beyond it slower.
-TOGETHER = 4
 
 
 class Cone:
@@ -512,8 +509,7 @@ class Tracer:
                 ray = self._ray(
                     front, chord, before, dr.fma(part, chord.length, self.overlap), time
                 )
-                coherent = ~cone.soft & (front.t < TOGETHER)
-                found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=querying)
+                found = scene.ray_intersect_preliminary(ray, coherent=False, active=querying)
                 hit = found.is_valid()
                 s = dr.select(hit, self._passed(chord, found, before), part * chord.length)
                 front = self._onward(front, chord, foot, part, s, face, hit, leaps)
