@@ -12,7 +12,7 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import pytest  # noqa: E402
 
-from command_line import BALL, BOX, LAMP, MESH, NIL, REPEATABLE, scene  # noqa: E402
+from command_line import BALL, BOX, LAMP, MESH, NIL, REPEATABLE, SENSOR, scene  # noqa: E402
 from nil_mitsuba import cli, stills  # noqa: E402
 from small_stills import SCENE, TRIANGLE, description  # noqa: E402
 
@@ -70,9 +70,16 @@ def still_folder(tmp_path, rgb):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A working folder with a scene in it."""
-    (tmp_path / "scene.xml").write_text(scene(NIL, REPEATABLE, LAMP))
+    (tmp_path / "scene.xml").write_text(scene(NIL, SENSOR, LAMP))
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def repeatable(folder):
+    """The scene of `folder` with a box filter: two renders of it are equal to the bit."""
+    (folder / "scene.xml").write_text(scene(NIL, REPEATABLE, LAMP))
+    return folder
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def test_without_a_checkpoint_resuming_begins_anew_and_says_so(command, folder):
     assert sorted(p.name for p in folder.iterdir()) == ["scene.exr", "scene.xml"]
 
 
-def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
+def test_parts_merge_to_the_picture_of_one_run(command, repeatable, monkeypatch):
     from nil_mitsuba import passes
 
     monkeypatch.setattr(passes, "WAVEFRONT_SAMPLES", 12 * 8 * 4)
@@ -64,9 +64,9 @@ def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
     assert planes("again.exr") == merged
 
     # Bad parts get a sentence, and the picture stays
-    before = (folder / "merged.exr").read_bytes()
+    before = (repeatable / "merged.exr").read_bytes()
     command("render", "scene.xml", "--spp", "16", "--passes", "0:1", "--seed", "1", "-o", "b.sums")
-    (folder / "c.sums").write_text("nothing")
+    (repeatable / "c.sums").write_text("nothing")
     for names, fragments in (
         (["scene.0-1.sums", "two.sums"], ["passes 0:1", "twice"]),
         (["scene.2-4.sums", "b.sums"], ["seed is 0 there and 1 here"]),
@@ -76,7 +76,7 @@ def test_parts_merge_to_the_picture_of_one_run(command, folder, monkeypatch):
         status, _, err = command("merge", *names, "-o", "merged.exr")
         line = complaint(err)
         assert status == 1 and [f for f in fragments if f not in line] == []
-    assert (folder / "merged.exr").read_bytes() == before
+    assert (repeatable / "merged.exr").read_bytes() == before
 
 
 def test_merged_parts_can_be_denoised(command, meshes):
@@ -124,7 +124,7 @@ def test_a_part_goes_on_with_other_passes(command, monkeypatch):
     assert checkpoint.load("p.sums").sums.passes == ((0, 4),)
 
 
-def test_a_merged_picture_tells_all_that_it_took(command, folder, monkeypatch):
+def test_a_merged_picture_tells_all_that_it_took(command, repeatable, monkeypatch):
     from nil_mitsuba import passes
 
     monkeypatch.setattr(passes, "WAVEFRONT_SAMPLES", 12 * 8 * 4)
@@ -134,7 +134,7 @@ def test_a_merged_picture_tells_all_that_it_took(command, folder, monkeypatch):
     before, lines = planes("scene.exr"), read("scene.exr")[0]["commandLine"].splitlines()
     assert len(lines) == 3 and all("-D format=float32" in line for line in lines[:2])
     for name in ("scene.0-1.sums", "scene.1-2.sums", "scene.exr"):
-        (folder / name).unlink()
+        (repeatable / name).unlink()
     for line in lines:
         assert command(*line.split()[1:])[0] == 0
     assert planes("scene.exr") == before
@@ -150,7 +150,7 @@ def test_merging_overwrites_no_samples_but_those_of_its_parts(command, folder):
     assert command("merge", "a.sums", "-o", "a.sums")[0] == 0
 
 
-def test_the_size_of_passes_renders_a_picture_again(command, monkeypatch):
+def test_the_size_of_passes_renders_a_picture_again(command, repeatable, monkeypatch):
     monkeypatch.setattr(stills, "LOOK_SAMPLES", 12 * 8 * 2)
     floats = ("render", "scene.xml", "-D", "format=float32")
     command(*floats, "--noise", "1e-9", "--spp", "8")

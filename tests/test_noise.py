@@ -43,7 +43,7 @@ def test_the_end_the_header_and_info_tell_one_noise(command):
     assert told(command) == f"{noise:.3g}"
 
 
-def test_a_resumed_still_ends_with_the_noise_of_all_its_passes(command):
+def test_a_resumed_still_ends_with_the_noise_of_all_its_passes(command, repeatable):
     command(*FOUR_PASSES)
     whole = stated()
     eight = ("render", "scene.xml", "--spp", "8", "--pass-spp", "4", "--checkpoint", "a.sums")

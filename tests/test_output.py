@@ -24,8 +24,7 @@ from command_line import (
 from nil_mitsuba import exr, stills
 
 
-def test_the_file_holds_what_the_integrator_renders(command, folder):
-    (folder / "scene.xml").write_text(scene(NIL, SENSOR, LAMP))
+def test_the_file_holds_what_the_integrator_renders(command):
     status, out, err = command("render", "scene.xml", "-D", "format=float32", "--seed", "3")
     assert (status, out) == (0, "scene.exr\n"), err
     _, types, pixels = read("scene.exr")
@@ -135,7 +134,7 @@ def test_compression_is_chosen(command):
     assert "compression piz" in command("info", "scene.exr")[1]
 
 
-def test_info_tells_how_to_render_it_again(command):
+def test_info_tells_how_to_render_it_again(command, repeatable):
     command("render", "scene.xml", "--seed", "5", "--layers", "distance")
     first = planes("scene.exr")
     status, out, err = command("info", "scene.exr")
