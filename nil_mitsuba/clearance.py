@@ -146,14 +146,6 @@ class Clearance:
         distance = SHORT * dr.sqrt(dr.fma(inside, inside, outside)) - self.slack
         return dr.select((outside > 0) & ~inner, larger(distance, 0), inside)
 
-    def leap(self, p: mi.Point3f, v: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
-        """Arc length (cells) for which the geodesic from ``p`` along ``v`` meets nothing.
-
-        A leap costs a tenth of a query or less, so that one is worth it down to a quarter of the
-        chord that would take its place.
-        """
-        return within(p, v, self.at(p, active), self.space.twist)
-
 
 class _Grid:
     """A grid of ``counts`` voxels with ``edges`` (cells) from the corner ``lower`` (cells) on.
@@ -394,17 +386,21 @@ def _along_axis(table: mi.Float, stride: int, count: int, edge: mi.Float, period
 def within(p: mi.Point3f, v: mi.Vector3f, clearance: mi.Float, twist: mi.Float) -> mi.Float:
     """Arc length for which the geodesic at ``p`` in direction ``v`` keeps within ``clearance``.
 
-    All in cells. It is at most ``speed`` s + M s²/2 off after s, where M bounds its acceleration
-    k (−w b, w a, a (b + k x w)): b − k x w is conserved, and x moves by no more than the clearance.
+    All in cells. It is at most u s + M s²/2 off after s, where u is its speed now and M bounds its
+    acceleration k (−w b, w a, a (b + k x w)): b − k x w is conserved, and x moves by no more than
+    the clearance r. Since s is at most r/u, r u/(u² + M r/2) is short enough; no root in it has to
+    wait for r. It grows with r up to u/|k| at least.
     """
     velocity = geometry.from_frame(p, v, twist)
     speed2 = dr.squared_norm(velocity)
-    kw = dr.abs(twist * v.z)
-    c2 = dr.fma(v.x, v.x, v.y * v.y)
-    lean = dr.fma(2 * kw, clearance, dr.abs(dr.fma(twist * v.z, p.x, v.y)))
-    most = dr.abs(twist) * dr.sqrt(c2 * dr.fma(lean, lean, v.z * v.z))
     speed = dr.sqrt(speed2)
-    return 2 * SHORT * clearance / (speed + dr.sqrt(dr.fma(2 * most, clearance, speed2)))
+    k, turn = dr.abs(twist), twist * v.z
+    level = k * dr.sqrt(dr.fma(v.x, v.x, v.y * v.y))
+    lean = dr.fma(turn, p.x, v.y)
+    bend = level * dr.sqrt(dr.fma(lean, lean, v.z * v.z))
+    r = smaller(clearance, speed / larger(k, 1e-9))
+    most = dr.fma(2 * dr.abs(turn) * level, r, bend)
+    return SHORT * r * speed / dr.fma(0.5 * most, r, speed2)
 
 
 def _counts(extents, total):

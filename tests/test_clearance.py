@@ -7,6 +7,7 @@ from drjit.llvm import Array3f64, Float64
 
 from benchmarks import truth
 from nil_mitsuba import geometry
+from nil_mitsuba.clearance import within
 
 POINTS, SAMPLES = 4_000, 20_000
 ROUNDING = 2e-6  # of the points that Mitsuba samples on surfaces, in scenes a few units large
@@ -226,10 +227,32 @@ def test_a_leap_ends_before_the_first_hit(rgb):
         rng = mi.PCG32(POINTS, 11)
         v = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         p = points_in((0, 0, 0), (1, 1, 1), 12)
-        leap = Float64(clearance.leap(p, v))
+        leap = Float64(within(p, v, clearance.at(p), clearance.space.twist))
         hit = truth.first_hit(surfaces, p, dr.normalize(Array3f64(v)), 0.6, twist, True)
         assert not dr.any(leap > hit.t)[0]
         assert dr.mean(leap)[0] > 0.05
+
+
+def test_a_leap_keeps_within_the_clearance(rgb):
+    """By float64 geodesics, also where that is many cells, and makes use of it."""
+    rng = mi.PCG32(POINTS, 13)
+    v = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    for far in (0.5, 30):
+        p = points_in((-far, -far, -far), (far, far, far), 14)
+        for twist in TWISTS:
+            last = mi.Float(0)
+            for room in (1e-3, 0.02, 0.3, 3, 100, 1e5):
+                leap = within(p, v, mi.Float(room), mi.Float(twist))
+                # A wider one is no shorter leap
+                assert dr.all(leap >= last)[0]
+                last = leap
+                for part in (0.5, 1):
+                    q, d = Array3f64(p), dr.normalize(Array3f64(v))
+                    there, _ = geometry.flow(q, d, part * Float64(leap), float(twist))
+                    assert dr.all(dr.norm(there - q) <= room)[0]
+            # Of what has no end a third of the longest chord, the arc of one radian
+            if far < 1:
+                assert dr.min(last)[0] > (0.3 / abs(twist) if twist else 0.999e5)
 
 
 def test_what_lies_far_outside_of_the_cube_takes_nothing(rgb):
