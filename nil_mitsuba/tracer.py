@@ -42,8 +42,12 @@ START = 0.4
 # First chords from a half to three halves of one would save half a query a ray, but the long ones
 # start towards what they leave, and that shows in benchmarks/accuracy.py's furnished cell.
 CORNER, STEEPEST = 2 / 3, 4
-# Leaps are worth it down to this part of a chord: each takes 8 to 12 ns, where a query takes 50.
-LEAST_LEAP = 0.25
+# Leaps are worth it down to this part of a chord: for each query all rays of a packet wait, and its
+# empty lanes cost as much.
+LEAST_LEAP = 0.1
+# Packets of rays that are seen are of one pixel or of a few. Up to this distance (cells) Embree is
+# faster when told that they go the same way, beyond it slower.
+TOGETHER = 4
 
 
 class Cone:
@@ -318,23 +322,46 @@ class Tracer:
         return line_ray(o, space.to_scene_axes(d), time, (before + last) * space.size)
 
     @dr.syntax
-    def _free(self, front: Front, h: mi.Float, seen: mi.Bool) -> mi.Float:
-        """Arc length (cells) that is known to be empty ahead of rays that are ``seen``.
+    def _leapt(
+        self,
+        front: Front,
+        chords: Chords,
+        unit: mi.Float,
+        cap: mi.Float,
+        reach: mi.Float,
+        leaping: mi.Bool,
+    ) -> Front:
+        """The front after leaps over what is known to be empty, while those are worth it.
 
-        Also around both ends of the leap, which are as far off the geodesic as corners beside
-        chords of the length h.
+        All rays of a packet leap before any is queried: Embree's time is that of whole packets.
         """
-        free = mi.Float(0)
-        if dr.hint(self.clearance is not None, mode="scalar"):
-            if seen:  # a branch: the others' chords are longer than what is free, as a rule
-                foot = front.foot
-                aside = dr.norm(front.vertex - foot.point)
-                bend = dr.norm(self.acceleration(foot))
-                aside = dr.fma(-2 * corner(h), bend, aside)
-                room = cast(Clearance, self.clearance).at(front.vertex) - aside
-                room = larger(room, 0)
-                free = within(foot.point, foot.direction, room, self.space.twist)
-        return dr.select(seen, free, 0)
+        leaping = leaping & (front.t < reach)
+        while leaping:
+            h = smaller(chords.after(front.t, cap), reach - front.t)
+            least = LEAST_LEAP * h
+            free = self._free(front, h)
+            leaping &= free > dr.fma(least, unit, least)
+            # Not all of what is free, so that the next chord begins at a random phase, too
+            length = smaller(smaller(dr.fma(-least, unit, free), chords.longest), reach - front.t)
+            leap, foot = self._ahead(front, dr.select(leaping, length, 0), corner(h))
+            vertex = dr.select(leaping, front.vertex + leap.along, front.vertex)
+            point, cell = foot.point, front.cell
+            if dr.hint(self.space.quotient, mode="scalar"):
+                vertex, (point,), cell = into_cell(vertex, [point], cell, leaping, self.space)
+            foot = Foot(point, foot.direction, foot.lost)
+            front = Front(vertex, foot, front.t + leap.length, cell)
+            leaping &= front.t < reach
+        return front
+
+    def _free(self, front: Front, h: mi.Float) -> mi.Float:
+        """Arc length (cells) that is known to be empty ahead, also around both ends of a leap,
+        which are as far off the geodesic as corners beside chords of the length h."""
+        foot = front.foot
+        aside = dr.abs(front.vertex - foot.point)
+        aside = dr.fma(-2 * corner(h), dr.abs(self.acceleration(foot)), aside)
+        aside = aside.x + aside.y + aside.z  # no less than its length, without a root
+        room = larger(cast(Clearance, self.clearance).at(front.vertex) - aside, 0)
+        return within(foot.point, foot.direction, room, self.space.twist)
 
     def _phased(self, front: Front, h: mi.Float, unit: mi.Float) -> mi.Float:
         """The length h of a chord, of which the first one has the part ``unit`` only."""
@@ -384,7 +411,6 @@ class Tracer:
         s: mi.Float,
         face: mi.Vector3i,
         hit: mi.Bool,
-        leaps: mi.Bool | None = None,
     ) -> Front:
         """The front after a ``part`` of a chord and the arc length ``s``; ``foot`` is at its end.
 
@@ -397,8 +423,6 @@ class Tracer:
             vertex = dr.fma(chord.along, part, front.vertex)
             face = dr.select(hit, 0, face)
             vertex, (point,), cell = through_face(vertex, [foot.point], cell, face, space)
-            if leaps is not None:
-                vertex, (point,), cell = into_cell(vertex, [point], cell, leaps, space)
             foot = Foot(point, foot.direction, foot.lost)
         else:
             t = front.t + chord.length
@@ -480,39 +504,33 @@ class Tracer:
             searching = active & (front.t < reach)
             hit = mi.Bool(False)
             while searching:
-                h = smaller(chords.after(front.t, cap), reach - front.t)
+                if dr.hint(self.clearance is not None, mode="scalar"):
+                    front = self._leapt(front, chords, unit, cap, reach, searching & ~cone.soft)
+                left = reach - front.t
+                h = smaller(chords.after(front.t, cap), left)
                 length = self._phased(front, h, unit)
                 lift = corner(smaller(h, STEEPEST * length))
-                querying, leaps = mi.Bool(searching), None
-                if dr.hint(self.clearance is not None, mode="scalar"):
-                    free = self._free(front, h, searching & ~cone.soft)
-                    leaps = free > LEAST_LEAP * (1 + unit) * h
-                    # Not all of what is free, so that the next chord begins at a random phase, too
-                    length = dr.select(leaps, free - LEAST_LEAP * unit * h, length)
-                    length = smaller(length, chords.longest)
-                    lift = dr.select(leaps, corner(h), lift)
-                    querying &= ~leaps
+                length = smaller(length, left)
                 if dr.hint(ends, mode="scalar"):
                     # What is there has to be on the side of all surfaces on which the chord ends
-                    lift = dr.select(length >= reach - front.t, 0, lift)
-                length = smaller(length, reach - front.t)
+                    lift = dr.select(length >= left, 0, lift)
                 chord, foot = self._ahead(front, length, lift)
                 part, face = self._exit(front, chord)
                 if dr.hint(bends_at_faces, mode="scalar"):
                     chord, part, off = self._balanced(
                         front, chord, foot, part, face, lift, off, cone.soft
                     )
-                if dr.hint(leaps is not None, mode="scalar"):
-                    part, face = dr.select(leaps, 1, part), dr.select(leaps, 0, face)
                 # Pieces overlap by the rounding of their joint, but none reaches behind the start
                 before = dr.select(front.t > 0, self.overlap, 0)
                 ray = self._ray(
                     front, chord, before, dr.fma(part, chord.length, self.overlap), time
                 )
-                found = scene.ray_intersect_preliminary(ray, coherent=False, active=querying)
+                coherent = ~cone.soft & (front.t < TOGETHER)
+                querying = searching & (left > 0)
+                found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=querying)
                 hit = found.is_valid()
                 s = dr.select(hit, self._passed(chord, found, before), part * chord.length)
-                front = self._onward(front, chord, foot, part, s, face, hit, leaps)
+                front = self._onward(front, chord, foot, part, s, face, hit)
                 cap *= 2
                 searching &= ~hit & (front.t < reach)
                 if not quotient:
