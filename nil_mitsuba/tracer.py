@@ -31,7 +31,7 @@ from .triangles import Triangle, Triangles
 # rough bounces, and towards lights. The first follows from how many rays name another surface near
 # silhouettes (benchmarks/camera_rays.py); the others are what the means and the shadows of the bent
 # Cornell box do not show (benchmarks/accuracy.py).
-SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.1, 0.4, 0.15
+SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.1, 0.4, 0.2
 # Rays that are seen are allowed at their start what they are at this distance (cells): of the many
 # short chords there few meet anything. Beyond a seventh of a cell that is within the tolerance.
 START = 0.4
