@@ -42,8 +42,8 @@ def chords(method, knob):
     return make
 
 
-# Of chords, and searches along tangents, a ray takes 41 (fixed), 52 (Dormand–Prince) and 34
-# (package) in ``room_scene``, and 52, 59 and 78 in ``cell_scene``
+# Of chords a ray takes 41 (fixed) and 52 (Dormand–Prince) in ``room_scene``, 52 and 59 in
+# ``cell_scene``; the package, which leaps, takes fewer
 TRACERS = {name: chords(name, knob) for name, knob in KNOBS.items()} | {"package": package}
 OTHERS = [name for name in TRACERS if name != "package"]
 
