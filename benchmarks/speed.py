@@ -3,6 +3,7 @@
 Times are processor time of all threads, because machines are noisy: the least, and the median of
 what was measured in rounds, in which everything that a row compares takes turns. With ``--beside``
 another checkout of this repository takes turns with this one, under the same scenes and clocks.
+Targets that are fractions, or 1, are parts of what that one takes.
 """
 
 import argparse
@@ -40,7 +41,6 @@ def ray_rows(space, chords):
         yield Row(workload, contestant, f"{what}: kernels", "kernels", "", "½")
 
 
-# A target that is a fraction is one of what the other checkout takes
 ROWS = [
     Row("box", "twist 1", "bent Cornell box, twist 1, over path", "passes", "path", "≤ 1.5"),
     Row("box", "twist 1", "its kernels", "kernels", "path"),
