@@ -1,14 +1,17 @@
 """Geodesic rays against Mitsuba's scene of straight-ray intersections.
 
 A ray is followed along its geodesic by chords, short enough for the error that the viewer
-tolerates, and by leaps where a grid of clearances knows that nothing is near. The corners lie
-outside of the curve, at places that differ from ray to ray, so that the polygon is off to both
-sides alike: on average a surface is met as often as it should be. What a chord has met tells where
-to look: the hit is where the geodesic meets the plane of that triangle or, if that is beside the
-triangle or the surface is bent, where its tangent line meets the surface. Where the tangent finds
-nothing (silhouettes, contacts, grazing rays), the chord is cut and tried again. Everything in this
-file is in cell coordinates, directions in cell axes, too, unless it says "scene". Directions that
-come in and go out, frame components, are turned to them at once and back at last.
+tolerates, and by leaps where a grid of clearances knows that nothing is near; around a plain scene
+it comes to the next box of shapes by exact bounds. The corners lie outside of the curve, at places
+that differ from ray to ray, so that the polygon is off to both sides alike: on average a surface is
+met as often as it should be. A face of the quotient's cell cuts a chord, and a new one begins
+behind it; cut chords of rays that nobody sees are turned to be right in the mean. What a chord has
+met tells where to look: the hit is where the geodesic meets the plane of that triangle or, if that
+is beside the triangle or the surface is bent, where its tangent line meets the surface. Where the
+tangent finds nothing (silhouettes, contacts, grazing rays), the chord is cut and tried again.
+Everything in this file is in cell coordinates, directions in cell axes, too, unless it says
+"scene". Directions that come in and go out, frame components, are turned to them at once and back
+at last.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from .triangles import Triangle, Triangles
 # Cornell box do not show (benchmarks/accuracy.py).
 SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.1, 0.4, 0.2
 # Rays that are seen are allowed at their start what they are at this distance (cells): of the many
-# short chords there few meet anything. Beyond a seventh of a cell that is within the tolerance.
+# short chords there few meet anything. Beyond a twentieth of a cell that is within the tolerance.
 START = 0.4
 # Corners lie outside the curve by so many sagittas. A first chord of any part of its length, each
 # as likely, is then right in the mean from its start on, to a twentieth of a sagitta: with τ of a
