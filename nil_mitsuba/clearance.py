@@ -17,7 +17,9 @@ from .geometry import larger, smaller
 from .quotient import Space, opaque
 from .shapes import FAR, Shapes, corners_of
 
-# Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere
+# Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere.
+# Finer ones save few chords more and take as much longer to fill as they are more (a render fills
+# them once).
 QUOTIENT_VOXELS = 56
 PLAIN_VOXELS = 2**18
 LEAST_VOXELS = 16
@@ -25,7 +27,8 @@ LEAST_VOXELS = 16
 FOCUS_VOXELS, FINEST, MOST_LEVELS = 48, 1 / 32, 16
 WORTHWHILE = 0.02  # cells, in the mean
 # Clearances are not followed further: in the quotient (cells), where farther copies are not
-# looked at, and elsewhere (voxels along the longest edge of one)
+# looked at, and elsewhere (voxels along the longest edge of one). Twice as far takes twice as long
+# to fill and saves no chords.
 FURTHEST, MOST_STEPS = 0.25, 12
 # Surfaces are thickened by this part of a voxel, and by so much of their largest coordinate: the
 # rounding of what says in which voxel they lie, and of Embree's own arithmetic.
