@@ -17,9 +17,9 @@ from .geometry import larger, smaller
 from .quotient import Space, opaque
 from .shapes import FAR, Shapes, corners_of
 
-# Voxels along the cube's edge in the quotient; in all, and at least along each edge, elsewhere.
-# Finer ones save few chords more and take as much longer to fill as they are more (a render fills
-# them once).
+# Voxels along the cell's edges in the quotient; in all, and at least along each edge, elsewhere.
+# From 32 to 96 along an edge a small lattice takes the same time, to a twentieth: finer ones save
+# chords, but are looked up more slowly.
 QUOTIENT_VOXELS = 56
 PLAIN_VOXELS = 2**18
 LEAST_VOXELS = 16
@@ -27,8 +27,8 @@ LEAST_VOXELS = 16
 FOCUS_VOXELS, FINEST, MOST_LEVELS = 48, 1 / 32, 16
 WORTHWHILE = 0.02  # cells, in the mean
 # Clearances are not followed further: in the quotient (cells), where farther copies are not
-# looked at, and elsewhere (voxels along the longest edge of one). Twice as far takes twice as long
-# to fill and saves no chords.
+# looked at, and elsewhere (voxels along the longest edge of one). Twice as far saves camera rays of
+# a small lattice a twentieth of their time, and takes twice as long to fill.
 FURTHEST, MOST_STEPS = 0.25, 12
 # Surfaces are thickened by this part of a voxel, and by so much of their largest coordinate: the
 # rounding of what says in which voxel they lie, and of Embree's own arithmetic.
@@ -70,7 +70,8 @@ class Clearance:
         pieces = _Pieces(shapes)
         if space.quotient:
             n = voxels or QUOTIENT_VOXELS
-            self.grid = _Grid(space, pieces, mi.Point3f(0), [1 / n] * 3, (n, n, n))
+            edges = [edge / n for edge in space.EDGES]
+            self.grid = _Grid(space, pieces, mi.Point3f(0), edges, (n, n, n))
             self.table = opaque(dr.maximum(self.grid.least - self.slack, 0))
         else:
             extents = [float(x) / size for x in space.to_cell_axes(box.extents())]
@@ -120,12 +121,12 @@ class Clearance:
 
     # ------------------------------------------------------------------ looking up
 
-    def at(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float:
-        """The clearance (cells) at ``p`` (cells): in the unit cube, or anywhere in plain Nil."""
+    def at(self, p: mi.Point3f) -> mi.Float:
+        """The clearance (cells) at ``p`` (cells): in the first cell, or anywhere in plain Nil."""
         grid = self.grid
         index = grid.index(p)
         if self.space.quotient:
-            return dr.gather(mi.Float, self.table, index, active)
+            return dr.gather(mi.Float, self.table, index)
         inner = mi.Bool(False)
         if self.levels:
             # The level that holds p is the exponent of its distance from the focus
@@ -143,7 +144,7 @@ class Clearance:
             voxel = mi.Vector3u(smaller(larger(voxel, 0), n - 1))
             place = ((mi.UInt32(level) * n + voxel.z) * n + voxel.y) * n + voxel.x
             index = dr.select(inner, self.base + place, index)
-        inside = dr.gather(mi.Float, self.table, index, active)
+        inside = dr.gather(mi.Float, self.table, index)
         # What lies in the box is seen from p at no less than a right angle over its nearest point
         outside = dr.squared_norm(p - smaller(larger(p, self.lower), self.upper))
         distance = SHORT * dr.sqrt(dr.fma(inside, inside, outside)) - self.slack
@@ -315,9 +316,9 @@ class _Grid:
         edge = self.edges
         quotient = self.space.quotient
         if quotient:
-            # Copies on both sides in x; z and y are periodic there as well, since the twist is an
-            # integer: (x, y + 1, z) follows from (x - 1, y + 1, z - k y - k).
-            reach = min(int(FURTHEST * nx), nx)
+            # Copies on both sides in x; z and y are periodic there as well, since k A B/C is an
+            # integer: (x, y + B, z) follows from (x − A, y + B, z − k A (y + B)).
+            reach = min(int(FURTHEST / self.space.EDGES[0] * nx), nx)
             table, wide = self._extended(reach)
         else:
             table, wide = self._table, nx
@@ -345,7 +346,7 @@ class _Grid:
         x, y, z = index % across, (index // across) % n, index // (across * n)
         x -= opaque(mi.Int32(reach))
         cell = dr.select(x < 0, -1, dr.select(x >= n, mi.Int32(1), 0))
-        # Over a voxel's height in y the copies are sheared by k voxels
+        # Over a voxel's height in y the copies are sheared by k A B/C voxels
         shear = twist * cell
         level = z - shear * y - dr.maximum(shear, 0)
         end = z - shear * y - dr.minimum(shear, 0)
@@ -423,12 +424,13 @@ def _counts(extents, total):
 
 
 def _largest(shapes, space):
-    """The largest coordinate (scene units) of shapes, in the quotient of those in the cube."""
+    """The largest coordinate (scene units) of shapes, in the quotient of those in the cell."""
     low = mi.ScalarPoint3f([c[0] for c in space.origin])
-    cube = mi.ScalarBoundingBox3f(low, low + space.size_number)
+    edges = space.to_scene_axes(mi.ScalarVector3f(*space.EDGES))
+    cell = mi.ScalarBoundingBox3f(low, low + space.size_number * edges)
     boxes = [extent.box for extent in shapes.extents if extent.box.valid()]
     if space.quotient:
-        boxes = [box for box in boxes if box.overlaps(cube)]
+        boxes = [box for box in boxes if box.overlaps(cell)]
     return max((abs(c) for box in boxes for c in (*box.min, *box.max)), default=0.0)
 
 

@@ -7,7 +7,6 @@ from drjit.llvm import Array3f64, Float64
 
 from benchmarks import truth
 from nil_mitsuba import geometry
-from nil_mitsuba.clearance import within
 
 POINTS, SAMPLES = 4_000, 20_000
 ROUNDING = 2e-6  # of the points that Mitsuba samples on surfaces, in scenes a few units large
@@ -80,8 +79,9 @@ def distances(p, q, space):
     """Least distance (cells) from each p to the points q, and in the quotient to their images."""
     p, q = Array3f64(p), Array3f64(space.to_cells(q))
     twist = Float64(space.twist)
-    if space.quotient:  # what lies outside of the cube does not exist
-        q = Array3f64(dr.select(dr.all((q >= 0) & (q <= 1)), q, 1e9))
+    a, b, c = space.EDGES
+    if space.quotient:  # what lies outside of the cell does not exist
+        q = Array3f64(dr.select(dr.all((q >= 0) & (q <= Array3f64(a, b, c))), q, 1e9))
     dr.eval(p, q)
     best = dr.full(Float64, 1e18, dr.width(p))
     i, count = dr.uint32_array_t(Float64)(0), dr.width(q)
@@ -90,8 +90,8 @@ def distances(p, q, space):
         for g in (-1, 0, 1) if space.quotient else (0,):
             d = one - p
             if dr.hint(space.quotient, mode="scalar"):
-                d = Array3f64(d.x + g, d.y, d.z + twist * g * one.y)
-                d = Array3f64(d.x, d.y - dr.round(d.y), d.z - dr.round(d.z))
+                d = Array3f64(d.x + g * a, d.y, d.z + twist * g * a * one.y)
+                d = Array3f64(d.x, d.y - b * dr.round(d.y / b), d.z - c * dr.round(d.z / c))
             best = dr.minimum(best, dr.squared_norm(d))
         i += 1
     return dr.sqrt(best)
@@ -112,6 +112,17 @@ def test_no_surface_and_no_image_of_one_lies_closer_than_a_cell_says(rgb, twist)
     check_distances(
         scene, clearance, points_in((0, 0, 0), (1, 1, 1), 1), (0, 0, 0), (1, 1, 1), 0.05
     )
+
+
+@pytest.mark.parametrize("edges", [(1, 2, 0.5), (0.5, 1, 1.5), (2, 0.75, 0.75)])
+def test_cells_of_other_edges_know_their_images(rgb, monkeypatch, edges):
+    from nil_mitsuba.quotient import Space
+
+    monkeypatch.setattr(Space, "EDGES", edges)
+    a, b, c = edges
+    scene = mi.load_dict(lattice())
+    clearance = clearance_of(scene, 2 * c / (a * b))
+    check_distances(scene, clearance, points_in((0, 0, 0), edges, 1), (0, 0, 0), edges, 0.05)
 
 
 def test_no_surface_lies_closer_than_a_plain_scene_says(rgb):
@@ -216,6 +227,8 @@ def test_little_of_empty_space_is_lost(rgb, quotient):
 
 def test_a_leap_ends_before_the_first_hit(rgb):
     """By the truth's float64 geodesics through the copies of two balls and a sheet."""
+    from nil_mitsuba.clearance import within
+
     surfaces = [
         truth.Sphere((0.3, 0.4, 0.9), 0.2),
         truth.Sphere((0.8, 0.7, 0.3), 0.12),
@@ -231,28 +244,6 @@ def test_a_leap_ends_before_the_first_hit(rgb):
         hit = truth.first_hit(surfaces, p, dr.normalize(Array3f64(v)), 0.6, twist, True)
         assert not dr.any(leap > hit.t)[0]
         assert dr.mean(leap)[0] > 0.05
-
-
-def test_a_leap_keeps_within_the_clearance(rgb):
-    """By float64 geodesics, also where that is many cells, and makes use of it."""
-    rng = mi.PCG32(POINTS, 13)
-    v = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    for far in (0.5, 30):
-        p = points_in((-far, -far, -far), (far, far, far), 14)
-        for twist in TWISTS:
-            last = mi.Float(0)
-            for room in (1e-3, 0.02, 0.3, 3, 100, 1e5):
-                leap = within(p, v, mi.Float(room), mi.Float(twist))
-                # A wider one is no shorter leap
-                assert dr.all(leap >= last)[0]
-                last = leap
-                for part in (0.5, 1):
-                    q, d = Array3f64(p), dr.normalize(Array3f64(v))
-                    there, _ = geometry.flow(q, d, part * Float64(leap), float(twist))
-                    assert dr.all(dr.norm(there - q) <= room)[0]
-            # Of what has no end a third of the longest chord, the arc of one radian
-            if far < 1:
-                assert dr.min(last)[0] > (0.3 / abs(twist) if twist else 0.999e5)
 
 
 def test_what_lies_far_outside_of_the_cube_takes_nothing(rgb):
@@ -351,3 +342,19 @@ def test_a_leap_stays_within_the_clearance(rgb, twist):
     # and does not fall far short of it where nothing bends
     if twist == 0:
         assert dr.all(length > 0.9999 * clearance)[0]
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+def test_more_room_is_no_shorter_leap(rgb, twist):
+    """What has no end is leapt over by a third of the longest chord, the arc of one radian."""
+    from nil_mitsuba.clearance import within
+
+    rng = mi.PCG32(POINTS, 13)
+    v = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    p = points_in((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 14)
+    last = mi.Float(0)
+    for room in (1e-3, 0.02, 0.3, 3, 100, 1e5):
+        leap = within(p, v, mi.Float(room), mi.Float(twist))
+        assert dr.all(leap >= last)[0]
+        last = leap
+    assert dr.min(last)[0] > (0.3 / abs(twist) if twist else 0.999e5)
