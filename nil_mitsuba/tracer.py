@@ -353,7 +353,8 @@ class Tracer:
                 vertex, (point,), cell = into_cell(vertex, [point], cell, leaping, self.space)
             foot = Foot(point, foot.direction, foot.lost)
             front = Front(vertex, foot, front.t + leap.length, cell)
-            leaping &= front.t < reach
+            # A short leap far out may be rounded to none
+            leaping &= (leap.length > 0) & (front.t < reach)
         return front
 
     def _free(self, front: Front, h: mi.Float) -> mi.Float:

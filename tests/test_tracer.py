@@ -166,6 +166,23 @@ def test_ten_million_random_rays_end(rgb, twist):
         check_that_rays_end(mi, p, v, twist)
 
 
+def test_leaps_that_are_rounded_to_none_end(rgb, monkeypatch):
+    """Far out, where the shortest chords are a few roundings of the length so far."""
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Chords, Cone, Tracer
+
+    mi = rgb
+    scene = mi.load_dict({"type": "scene", **truth.to_mitsuba(truth.cell_scene(), mi)})
+    tracer = Tracer(scene, Space(1, True, [0, 0, 0], 1.0), 4000.0)
+    monkeypatch.setattr(tracer, "_free", lambda front, h: 0.15 * h)
+    p, v = mi.Point3f(0.5), mi.Vector3f(0.6, 0, 0.8)
+    chords = Chords(v, tracer.space.twist, Cone(0, 3e-4), 0.1, 0.4, tracer.least)
+    front = tracer._start(p, p, v)
+    front.t = mi.Float(257, 600, 1025, 2049)
+    end = tracer._leapt(front, chords, mi.Float(0), mi.Float(0), mi.Float(4000), mi.Bool(True))
+    assert dr.all(end.t >= front.t)
+
+
 @pytest.mark.parametrize("quotient", [False, True])
 def test_rays_that_are_not_numbers_end(rgb, quotient):
     from nil_mitsuba.quotient import Space
