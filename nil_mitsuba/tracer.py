@@ -139,7 +139,8 @@ def line_ray(o: mi.Point3f, d: mi.Vector3f, time: mi.Float, maxt: mi.Float = dr.
 
 
 class Chords:
-    """Lengths (cells) of chords whose sagitta keeps within ``part`` of the cone at their middle.
+    """Lengths (cells) of chords whose sagitta keeps within a part, ``sagitta``, of the cone's width
+    at their middle.
 
     The acceleration of the geodesic's point is k (−w b, w a, a b) in frame components, and across
     its direction no longer than g = |k| c √(w² + a² b²) ≤ |k| c √(w² + c⁴/4) = ``across``. The
@@ -148,14 +149,14 @@ class Chords:
     nor longer than 1/k, beyond which it is no parabola.
     """
 
-    def __init__(self, v, twist, cone, part, start, least):
+    def __init__(self, v, twist, cone, sagitta, start, least):
         k = larger(dr.abs(twist), 1e-9)
         c2 = dr.fma(v.x, v.x, v.y * v.y)
         across = k * dr.sqrt(c2 * dr.fma(0.25 * c2, c2, dr.square(v.z)))
         self.across = larger(across, 1e-9)
         self.longest = dr.rcp(k)
-        self.spread = part * cone.spread
-        self.width = dr.fma(self.spread, start, part * cone.width)
+        self.spread = sagitta * cone.spread
+        self.width = dr.fma(self.spread, start, sagitta * cone.width)
         self.scale = 2 * dr.rcp(self.across)
         self.least = least
 
@@ -458,9 +459,9 @@ class Tracer:
         """First hit of the geodesic from ``p`` (cells) in frame direction ``v`` (scene axes) within
         ``reach``; if ``ends``, in the quotient also where those come to that meet nothing.
 
-        In the quotient ``p`` lies in the unit cube. A hit of a ray that is seen lies off the
-        geodesic by at most 1e-5 cells or 1/250 of the cone, whichever is more; where the geodesic
-        only just misses what its chord meets, by the chord's error, which keeps within the cone.
+        In the quotient ``p`` lies in the first cell. A hit of a ray that is seen lies off the
+        geodesic by at most 4e-6 cells and 1/250 of the cone; where the geodesic only just misses
+        what its chord meets, by the chord's error, which keeps within the cone.
         """
         v = self.space.to_cell_axes(v)
         if self.space.flat and not self.space.quotient:
@@ -487,8 +488,8 @@ class Tracer:
         space, scene = self.space, self.scene
         k = space.twist
         quotient = space.quotient
-        part = dr.select(cone.soft, SOFT_SAGITTA, SAGITTA)
-        chords = Chords(v, k, cone, part, dr.select(cone.soft, 0, START), self.least)
+        sagitta = dr.select(cone.soft, SOFT_SAGITTA, SAGITTA)
+        chords = Chords(v, k, cone, sagitta, dr.select(cone.soft, 0, START), self.least)
         unit = random_of(p, v)
         front = self._start(p, p, v)
         chord = Chord(mi.Vector3f(0), mi.Float(0))
