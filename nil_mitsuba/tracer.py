@@ -356,6 +356,8 @@ class Tracer:
             front = Front(vertex, foot, front.t + leap.length, cell)
             # A short leap far out may be rounded to none
             leaping &= (leap.length > 0) & (front.t < reach)
+            if dr.hint(not self.space.quotient, mode="scalar"):
+                leaping &= ~self.occupied.excludes(vertex)  # `_approach` goes farther
         return front
 
     def _free(self, front: Front, h: mi.Float) -> mi.Float:

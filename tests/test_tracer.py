@@ -1,5 +1,7 @@
 """Single rays of the tracer against float64 root finding that shares no code with it."""
 
+import contextlib
+import itertools
 import math
 
 import drjit as dr
@@ -78,6 +80,50 @@ def test_a_shadow_ray_ends_at_a_light_thousands_of_cells_away(rgb):
         tracer = Tracer(scene, Space(1.0, False, [0] * 3, 1.0), dr.inf)
         blocked = tracer.occluded(p, p, v, Cone(0, 1e-6), mi.Float(5000), mi.Bool(True))
         assert blocked[0] == expected
+
+
+@contextlib.contextmanager
+def counted_leaps(monkeypatch, most):
+    """No more than so many steps of leaps, counted one by one; yields their counter."""
+    from nil_mitsuba.tracer import Tracer
+
+    free, calls = Tracer._free, itertools.count(1)
+
+    def counted(*args):
+        assert next(calls) <= most
+        return free(*args)
+
+    monkeypatch.setattr(Tracer, "_free", counted)
+    with (
+        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
+        dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False),
+    ):
+        yield calls
+
+
+def test_rays_into_the_sky_over_a_large_ground_are_gone_after_a_few_leaps(rgb, monkeypatch):
+    """By the bound of their reach alone, most might come back within hundreds of cells."""
+    from nil_mitsuba.quotient import Space
+    from nil_mitsuba.tracer import Cone, Tracer
+
+    mi = rgb
+    wide = mi.ScalarTransform4f().scale(50)
+    scene = {
+        "type": "scene",
+        "ground": {"type": "rectangle", "to_world": wide},
+        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5},
+    }
+    focus = mi.ScalarPoint3f(0, -3, 1.5)
+    tracer = Tracer(mi.load_dict(scene), Space(1.0, False, [0] * 3, 1.0), dr.inf, focus=focus)
+    assert tracer.clearance is not None
+    rng = mi.PCG32(1000)
+    v = mi.warp.square_to_uniform_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    p = mi.Point3f(focus)
+    reach = tracer.reach(p, v)
+    assert dr.count(reach > 300)[0] > 500
+    with counted_leaps(monkeypatch, 200) as leaps:
+        dr.eval(tracer.intersect(p, v, Cone(0, 1e-3), reach, mi.Bool(True)).valid)
+    assert next(leaps) > 10  # they do leap
 
 
 def test_chords_are_as_far_inside_of_the_curve_as_outside(rgb):
