@@ -356,7 +356,8 @@ def test_hidden_emitters_and_what_is_around_a_dome_are_transparent(rgb):
 
 def test_clip_distances_are_lengths_along_every_ray(rgb):
     near, far = 0.3, 1.2
-    nil = mi.load_dict(PLAIN | {"max_depth": 1, "aovs": "distance"})
+    # Rays that graze a ball may come to it from elsewhere, within a tolerance that is small here
+    nil = mi.load_dict(PLAIN | {"max_depth": 1, "aovs": "distance", "tolerance": 0.01})
     whole, cut = (
         mi.render(furnished(of_kind("spherical") | clip), integrator=nil, spp=1)[:, :, 3].array
         for clip in ({}, {"near_clip": near, "far_clip": far})
