@@ -6,7 +6,8 @@ many squares of 4×4 pixels, in which smaller errors of neighbours add up, diffe
 
 Constants are chosen on the Cornell box; the furnished cell has ruled out longer first chords and
 shown what chords need that a face has cut. The others are for stating what was reached: nothing is
-chosen by them. All are full of contacts, creases and shadows, where errors show.
+chosen by their images. All but the small lattice are full of contacts, creases and shadows, where
+errors show.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .worker import command
-from .workloads import bent_box, camera
+from .workloads import bent_box, camera, small_lattice
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -239,6 +240,7 @@ SCENES = {
     "glossy room": lambda width, t: mi.load_dict(glossy_room(width, t)),
     "furnished cell": lambda width, t: mi.load_dict(furnished_cell(width, t)),
     "meadow of curves": meadow,
+    "small lattice": lambda width, t: small_lattice(width, 1, "box", tolerance=t),
 }
 
 

@@ -108,15 +108,15 @@ def open_scene(width, integrator):
     )
 
 
-def small_lattice(width, twist):
+def small_lattice(width, twist, rfilter="gaussian", **properties):
     """A ball, a box and a peg in the quotient's cell, under an even sky."""
     at = mi.ScalarTransform4f
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "nil", "max_depth": 4, "twist": twist},
+            "integrator": {"type": "nil", "max_depth": 4, "twist": twist} | properties,
             "sky": {"type": "constant"},
-            "sensor": camera(width, (0.1, 0.12, 0.6), (0.7, 1, 0.45), 75),
+            "sensor": camera(width, (0.1, 0.12, 0.6), (0.7, 1, 0.45), 75, rfilter),
             "ball": {"type": "sphere", "center": [0.3, 0.7, 0.3], "radius": 0.09},
             "box": {
                 "type": "cube",
