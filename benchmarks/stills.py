@@ -20,6 +20,8 @@ import mitsuba as mi
 from nil_mitsuba import checkpoint, stills
 from nil_mitsuba.layers import RENDERED
 
+from .worker import alone
+
 SCENE = str(pathlib.Path(__file__).parents[1] / "scenes" / "cornell-box.xml")
 ALL_LAYERS = ", ".join(RENDERED)
 
@@ -118,23 +120,25 @@ def peak_memory(spp):
     )
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
-            [
-                sys.executable,
-                "-c",
-                code,
-                "render",
-                SCENE,
-                "-D",
-                "resx=480",
-                "-D",
-                "resy=270",
-                "-P",
-                "max_depth=4",
-                "--spp",
-                str(spp),
-                "-o",
-                os.path.join(folder, "a.exr"),
-            ],
+            alone(
+                [
+                    sys.executable,
+                    "-c",
+                    code,
+                    "render",
+                    SCENE,
+                    "-D",
+                    "resx=480",
+                    "-D",
+                    "resy=270",
+                    "-P",
+                    "max_depth=4",
+                    "--spp",
+                    str(spp),
+                    "-o",
+                    os.path.join(folder, "a.exr"),
+                ]
+            ),
             capture_output=True,
             text=True,
             check=True,

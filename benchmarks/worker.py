@@ -28,6 +28,12 @@ def command(checkout, code, *arguments):
     return [sys.executable, "-c", START + code, str(checkout), str(ROOT), *map(str, arguments)]
 
 
+def alone(words):
+    """A command whose process has a peak of memory (``ru_maxrss``) of its own: on Linux one that
+    executes another program hands it on, and who measures here may have had more."""
+    return ["sh", "-c", '"$@"; exit $?', "sh", *words]
+
+
 class Worker:
     """The process, as who gives it work sees it."""
 

@@ -411,11 +411,13 @@ print(json.dumps({"passes": found["passes"], "MiB": added / 1024 * 1e6 / width**
     def run(self, seed):
         import nil_mitsuba
 
-        from .worker import command
+        from .worker import alone, command
 
         with tempfile.TemporaryDirectory() as home:  # Dr.Jit keeps its kernels below it
             done = subprocess.run(
-                command(pathlib.Path(nil_mitsuba.__file__).parents[1], self.CODE, self.width),
+                alone(
+                    command(pathlib.Path(nil_mitsuba.__file__).parents[1], self.CODE, self.width)
+                ),
                 cwd=ROOT,
                 env=os.environ | {"HOME": home},
                 capture_output=True,

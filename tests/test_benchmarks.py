@@ -94,3 +94,14 @@ def test_the_viewfinder_is_timed():
     assert done.returncode == 0, done.stderr[-2000:]
     rows = [line.split() for line in done.stdout.splitlines() if line.split()[1:2] == ["yes"]]
     assert [row[0] for row in rows] == ["showcase", "cornell-box"]
+
+
+def test_memory_is_measured_without_that_of_who_asks():
+    from benchmarks.worker import alone
+
+    code = "import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    taken = b"x" * 2**28
+    run = subprocess.run(
+        alone([sys.executable, "-c", code]), capture_output=True, text=True, check=True
+    )
+    assert len(taken) == 2**28 and float(run.stdout) < 128

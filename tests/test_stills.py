@@ -10,6 +10,7 @@ import mitsuba as mi
 import pytest
 
 import nil_mitsuba
+from benchmarks.worker import alone
 from conftest import ROOT
 from nil_mitsuba import checkpoint, stills
 from nil_mitsuba.sums import name_noise
@@ -290,25 +291,27 @@ def test_full_hd_stays_below_4_gibibytes(still_folder):
     sizes = []
     for spp in ("2", "6"):  # the second pass meets the sums of the first
         run = subprocess.run(
-            [
-                sys.executable,
-                "-c",
-                code,
-                "render",
-                str(ROOT / "scenes" / "cornell-box.xml"),
-                "-D",
-                "resx=1920",
-                "-D",
-                "resy=1080",
-                "-P",
-                "max_depth=2",
-                "--spp",
-                spp,
-                "-o",
-                str(still_folder / "a.exr"),
-                "--layers",
-                "distance,position,normal,albedo,cell,shape,samples",
-            ],
+            alone(
+                [
+                    sys.executable,
+                    "-c",
+                    code,
+                    "render",
+                    str(ROOT / "scenes" / "cornell-box.xml"),
+                    "-D",
+                    "resx=1920",
+                    "-D",
+                    "resy=1080",
+                    "-P",
+                    "max_depth=2",
+                    "--spp",
+                    spp,
+                    "-o",
+                    str(still_folder / "a.exr"),
+                    "--layers",
+                    "distance,position,normal,albedo,cell,shape,samples",
+                ]
+            ),
             capture_output=True,
             text=True,
             timeout=600,
