@@ -1,4 +1,4 @@
-"""Prints how far images at the default tolerance are from those at a sixteenth of it.
+"""Prints how far images at the default tolerance are from those at a sixteenth of it, or less.
 
 Of each scene: the mean's relative difference between renders of the same seeds, and its standard
 error; the share of paths that bring something else; and at 1,024 samples how many pixels, and how
@@ -28,8 +28,7 @@ from .workloads import bent_box, camera, small_lattice
 
 mi.set_variant("llvm_ad_rgb")
 
-# Pixels, and a tolerance in parts of them: the default one, and what stands for exact
-TOLERANCES = 0.25, 0.25 / 16
+TOLERANCE = 0.25  # pixels, the default
 # Means are compared until their difference is known so well
 STANDARD_ERROR = 0.0004
 FEWEST = 16  # seeds, for a standard error that can be believed
@@ -316,6 +315,12 @@ def main(words):
     parser.add_argument("--of", metavar="FOLDER", help="another checkout, to measure its package")
     parser.add_argument("--only", nargs="+", choices=SCENES, help="scenes (default: all)")
     parser.add_argument("--seed", type=int, default=1000, help="first one (default: 1000)")
+    parser.add_argument(
+        "--part",
+        type=float,
+        default=16,
+        help="the tolerance over this stands for exact (default: 16)",
+    )
     arguments = parser.parse_args(words)
     if arguments.of:
         again = [word for word in words if word != arguments.of and word != "--of"]
@@ -329,7 +334,7 @@ def main(words):
     print(f"package: {pathlib.Path(nil_mitsuba.__file__).parent}")
     for name in arguments.only or SCENES:
         began = time.perf_counter()
-        scenes = [SCENES[name](width, tolerance) for tolerance in TOLERANCES]
+        scenes = [SCENES[name](width, TOLERANCE / part) for part in (1, arguments.part)]
         difference, error, seeds = means_apart(scenes, spp, arguments.seed, most)
         changed = paths_changed(scenes, range(arguments.seed, arguments.seed + min(16, most)))
         print(
