@@ -316,7 +316,7 @@ def main(words):
     parser.add_argument("--only", nargs="+", choices=SCENES, help="scenes (default: all)")
     parser.add_argument("--seed", type=int, default=1000, help="first one (default: 1000)")
     parser.add_argument(
-        "--part",
+        "--divisor",
         type=float,
         default=16,
         help="the tolerance over this stands for exact (default: 16)",
@@ -334,7 +334,7 @@ def main(words):
     print(f"package: {pathlib.Path(nil_mitsuba.__file__).parent}")
     for name in arguments.only or SCENES:
         began = time.perf_counter()
-        scenes = [SCENES[name](width, TOLERANCE / part) for part in (1, arguments.part)]
+        scenes = [SCENES[name](width, TOLERANCE / part) for part in (1, arguments.divisor)]
         difference, error, seeds = means_apart(scenes, spp, arguments.seed, most)
         changed = paths_changed(scenes, range(arguments.seed, arguments.seed + min(16, most)))
         print(

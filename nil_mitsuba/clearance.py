@@ -27,8 +27,8 @@ LEAST_VOXELS = 16
 FOCUS_VOXELS, FINEST, MOST_LEVELS = 48, 1 / 32, 16
 WORTHWHILE = 0.02  # cells, in the mean
 # Clearances are not followed further: in the quotient (cells), where farther copies are not
-# looked at, and elsewhere (voxels along the longest edge of one). Twice as far saves camera rays of
-# a small lattice a twentieth of their time, and takes twice as long to fill.
+# looked at, and elsewhere (voxels along the longest edge of one). Twice as far saves a small
+# lattice's camera rays a twentieth of their time at most.
 FURTHEST, MOST_STEPS = 0.25, 12
 # Surfaces are thickened by this part of a voxel, and by so much of their largest coordinate: the
 # rounding of what says in which voxel they lie, and of Embree's own arithmetic.

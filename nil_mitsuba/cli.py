@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import functools
 import json
@@ -1079,7 +1080,7 @@ def _ending(state: checkpoint.Checkpoint, denoised: bool) -> str:
     return f"{_how_far(state, denoised)}{advice}."
 
 
-class _Bar:
+class _Bar(abc.ABC):
     """Tells on stderr how far something is: a bar on a terminal; elsewhere, if it has ``lines``, a
     line now and then.
 
@@ -1130,9 +1131,9 @@ class _Bar:
         with contextlib.suppress(OSError):  # as in _note
             self.bar.set_description_str(text, refresh=True)
 
+    @abc.abstractmethod
     def _state(self) -> tuple[float, str]:
         """The part that is done, and words; none before there is something to say."""
-        raise NotImplementedError
 
     def _clock(self, seconds: float) -> str:
         # Beyond thirty years no one waits, and the estimate means nothing

@@ -7,6 +7,7 @@ to the left, y up, z forward. "nil" knows them by their parameters, as any other
 
 from __future__ import annotations
 
+import abc
 import math
 from typing import Any, NamedTuple
 
@@ -78,9 +79,9 @@ class PythonSensor(mi.Sensor):
         width, height = self.film().size()
         return int(width), int(height) // (2 if self.eye == "both" else 1)
 
+    @abc.abstractmethod
     def _look(self, place: mi.Point2f, side: mi.Float) -> Look:
         """How one looks through a place on the film (0 to 1), ``side`` scene units to the right."""
-        raise NotImplementedError
 
     # --------------------------------------------------------- what Mitsuba asks for
 
