@@ -108,7 +108,8 @@ def test_without_the_wheel_the_newest_llvm_of_the_system_is_chosen(
     tried = [text.removeprefix(f"{tmp_path}/").split(" ")[0] for text in llvm._rejected]
     assert tried == ["libLLVM-21.so.1", "libLLVM.so.19.1"]
 
-    monkeypatch.setattr(llvm, "_loads", lambda path: "21" not in path)
+    # By the file's name: pytest counts its folders, too, and comes to pytest-21.
+    monkeypatch.setattr(llvm, "_loads", lambda path: "21" not in os.path.basename(path))
     llvm.select()
     assert os.environ[llvm.VARIABLE] == str(tmp_path / "libLLVM.so.19.1")
 
