@@ -83,7 +83,12 @@ def compare(mi, kind, twist, tolerance, width=WIDTH, make=None):
     q = truth.multiply(
         Array3f64(g), Array3f64(*(truth.Float64(dr.detach(c)) for c in found_p)), twist
     )
-    error = truth.across_error(*wide, exact.t, q, twist) / (2e-5 + 2e-6 * exact.t)
+    # Beside silhouettes hits may be a chord's, which is off by a twentieth of the cone, and on the
+    # first cells by a twentieth of what that is after `tracer.START`
+    spread = truth.Float64(dr.detach(cone.spread))
+    aside = dr.select(near, 0.05 * spread * dr.maximum(exact.t, 0.4), 0)
+    allowance = 2e-5 + 2e-6 * exact.t + aside
+    error = truth.across_error(*wide, exact.t, q, twist) / allowance
     error = dr.select(hit_both, error, 0)
     far = dr.count(wrong & ~near)[0] / max(1, dr.count(~near)[0])
     close = dr.count(wrong & near)[0] / max(1, dr.count(near)[0])

@@ -11,9 +11,8 @@ from benchmarks import truth
 from benchmarks.camera_rays import compare
 from nil_mitsuba import geometry
 
-# Three times what is measured: the share of rays near silhouettes that name another surface, and
-# the part of their allowance by which hits are off
-LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 1.0)}
+# Three times what is measured: the share of rays near silhouettes that name another surface
+LIMITS = {"quotient": 3.3e-3, "plain": 2.1e-3}
 
 
 @pytest.mark.parametrize(
@@ -30,12 +29,11 @@ LIMITS = {"quotient": (3.6e-3, 0.65), "plain": (1.6e-3, 1.0)}
 def test_every_ray_names_the_true_surface(rgb, kind, twist):
     far, close, error, _ = compare(rgb, kind, twist, 0.25)
     assert far == 0
-    assert close <= LIMITS[kind][0]
-    assert error <= LIMITS[kind][1]
+    assert close <= LIMITS[kind]
+    assert error <= 1
     finer, coarser = (compare(rgb, kind, twist, tolerance)[1] for tolerance in (0.25 / 4, 1))
-    # A single ray may be left at both of the finer ones
-    assert finer <= close
-    assert twist == 0 or close < 0.5 * coarser
+    # Sagittas are as large as the tolerance; float32 leaves a ray or two at any
+    assert twist == 0 or (close < 0.5 * coarser and finer < 0.25 * coarser)
 
 
 def test_shapes_that_mitsuba_merges_keep_their_box(rgb):
@@ -137,7 +135,7 @@ def test_a_leap_that_rounding_takes_away_is_none(rgb, monkeypatch):
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2}})
     tracer = Tracer(scene, Space(1.0, False, [0] * 3, 1.0), dr.inf)
     p, v, t = mi.Point3f(0.1, 0, 0), mi.Vector3f(0, 0.6, 0.8), mi.Float(300)
-    chords = Chords(v, tracer.space.twist, Cone(), 1, 0, tracer.least)
+    chords = Chords(v, tracer.space.twist, Cone(), 1, 0, tracer.least, 1)
     # Just worth it, for a ray with a phase of a half
     free = 1.501 * LEAST_LEAP * chords.shortest(t)
     monkeypatch.setattr(Tracer, "_free", lambda *_: mi.Float(free))
