@@ -47,12 +47,12 @@ START = 0.4
 # First chords from a half to three halves of one would save half a query a ray, but the long ones
 # start towards what they leave, and that shows in benchmarks/accuracy.py's furnished cell.
 CORNER, STEEPEST = 2 / 3, 4
-# The longest chord, times k: beyond 1 it is no parabola. Where faces cut it, it has to be shorter: a
-# chord from face to face is off by as much in the middle of each cell, where most things are.
+# The longest chord, times k: beyond 1 it is no parabola. In the quotient that would be too long: a
+# chord from face to face is off to the same side in the middle of each cell, where most things are.
 LONGEST, LONGEST_IN_CELL = 1.0, 0.7
 # Rays from a point meet again at conjugate points. Towards one, chords are no longer than this part
-# of the way there, but need not be shorter than that, times 1/k. Both chosen by how many of the rays
-# that leave surfaces of a small lattice come to the sky (benchmarks/refocus.py).
+# of the way there, but need not be shorter than that one, times 1/k. All but the 1 are chosen by
+# how many rays from surfaces of a small lattice come to the sky (benchmarks/conjugate_points.py).
 TOWARDS_FOCUS, AT_FOCUS = 0.5, 0.25
 # Leaps are worth it down to this part of a chord: for each query all rays of a packet wait, and its
 # empty lanes cost as much. Camera rays of a small lattice take a quarter less time than at 0.25 and
@@ -159,8 +159,8 @@ class Chords:
     nor longer than ``longest``/k.
 
     After 2π/(k |w|), its ``period``, and after multiples of that a geodesic is on the fibre through
-    its start again (a conjugate point, see `geometry.area_density`), and so are its neighbours: they
-    all meet what stands there, or none does, and errors of the mean zero do not cancel.
+    its start again (a conjugate point, see `geometry.area_density`), and so are its neighbours:
+    they all meet what stands there, or none does, and errors of the mean zero do not cancel.
     """
 
     def __init__(self, v, twist, cone, sagitta, start, least, longest):

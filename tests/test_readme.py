@@ -47,6 +47,7 @@ TESTED_BY = {
 QUICK = (
     "benchmarks.camera_rays",
     "benchmarks.accuracy",
+    "benchmarks.conjugate_points",
     "benchmarks.emitter_sampling",
     "benchmarks.stills",
 )
