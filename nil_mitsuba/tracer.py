@@ -8,9 +8,10 @@ met as often as it should be. A face of the quotient's cell cuts a chord, and a 
 behind it; cut chords of rays that nobody sees are turned to be right in the mean. What a chord has
 met tells where to look: the hit is where the geodesic meets the plane of that triangle or, if that
 is beside the triangle or the surface is bent, where its tangent line meets the surface. Where the
-tangent finds nothing (silhouettes, grazing rays), the chord's hit is taken as it is, since as many
-are missed by chords; only a ray's first chord, which lies by what the ray leaves, is cut and tried
-again.
+tangent finds nothing (silhouettes, grazing rays), the chord's hit is taken as it is, since chords
+miss as many. The chord is cut and tried again where that is not so: the first one, which runs
+beside what the ray leaves, and those behind the first turn, where what one turn has missed is met
+by another.
 Everything in this file is in cell coordinates, directions in cell axes, too, unless it says
 "scene". Directions that come in and go out, frame components, are turned to them at once and back
 at last.
@@ -32,11 +33,11 @@ from .quotient import Space, exit_through_face, into_cell, opaque, through_face
 from .shapes import Shapes
 from .triangles import Triangle, Triangles
 
-# A chord's sagitta is about this part of the cone's width there: along rays that are seen, behind
-# rough bounces, and towards lights. The first follows from how many rays name another surface near
-# silhouettes (benchmarks/camera_rays.py); the others are what the means and the shadows of the bent
-# Cornell box do not show (benchmarks/accuracy.py).
-SAGITTA, SOFT_SAGITTA, SHADOW_SAGITTA = 0.07, 0.4, 0.2
+# A chord's sagitta is about this part of the cone's width there: along rays that are seen, and along
+# those behind rough bounces or towards lights. The first follows from how many rays name another
+# surface near silhouettes (benchmarks/camera_rays.py); the second is what the means and the shadows
+# of the bent Cornell box do not show (benchmarks/accuracy.py).
+SAGITTA, SOFT_SAGITTA = 0.07, 0.2
 # Rays that are seen are allowed at their start what they are at this distance (cells): of the many
 # short chords there few meet anything. Beyond a twentieth of a cell that is within the tolerance.
 START = 0.4
@@ -47,13 +48,10 @@ START = 0.4
 # First chords from a half to three halves of one would save half a query a ray, but the long ones
 # start towards what they leave, and that shows in benchmarks/accuracy.py's furnished cell.
 CORNER, STEEPEST = 2 / 3, 4
-# The longest chord, times k: beyond 1 it is no parabola. In the quotient that would be too long: a
-# chord from face to face is off to the same side in the middle of each cell, where most things are.
-LONGEST, LONGEST_IN_CELL = 1.0, 0.7
-# Rays from a point meet again at conjugate points. Towards one, chords are no longer than this part
-# of the way there, but need not be shorter than that one, times 1/k. All but the 1 are chosen by
-# how many rays from surfaces of a small lattice come to the sky (benchmarks/conjugate_points.py).
-TOWARDS_FOCUS, AT_FOCUS = 0.5, 0.25
+# Near conjugate points on the fibre through its start a ray's chords are at most this part of the
+# way to the closest one, or this part of 1/k where that is more; chosen by how many rays from
+# surfaces of a small lattice come to the sky (benchmarks/conjugate_points.py).
+TO_CONJUGATE, AT_CONJUGATE = 0.5, 0.25
 # Leaps are worth it down to this part of a chord: for each query all rays of a packet wait, and its
 # empty lanes cost as much. Camera rays of a small lattice take a quarter less time than at 0.25 and
 # about the same at 0.05; those of the bent Cornell box take the same at 0.25, too.
@@ -156,23 +154,23 @@ class Chords:
     its direction no longer than g = |k| c √(w² + a² b²) ≤ |k| c √(w² + c⁴/4) = ``across``. The
     sagitta is at most h² g/8, and h² g/8 = width + spread (t + h/2) is solved for h, the cone being
     as wide at its start as elsewhere at the distance ``start``. No chord is shorter than ``least``
-    nor longer than ``longest``/k.
+    nor longer than 1/k, beyond which it is no parabola.
 
-    After 2π/(k |w|), its ``period``, and after multiples of that a geodesic is on the fibre through
-    its start again (a conjugate point, see `geometry.area_density`), and so are its neighbours:
-    they all meet what stands there, or none does, and errors of the mean zero do not cancel.
+    After a turn, the arc length 2π/(k |w|), a geodesic is on the fibre through its start again, in
+    a conjugate point (`geometry.area_density`), and so are its neighbours of the same w: they all
+    meet what stands there, or none does, and errors of the mean zero do not cancel. So it is after
+    each further turn, and chords are shorter there.
     """
 
-    def __init__(self, v, twist, cone, sagitta, start, least, longest):
+    def __init__(self, v, twist, cone, sagitta, start, least):
         k = larger(dr.abs(twist), 1e-9)
         c2 = dr.fma(v.x, v.x, v.y * v.y)
         across = k * dr.sqrt(c2 * dr.fma(0.25 * c2, c2, dr.square(v.z)))
         self.across = larger(across, 1e-9)
-        per_twist = dr.rcp(k)
-        self.longest = longest * per_twist
-        self.at_focus = AT_FOCUS * per_twist
-        self.per_period = k * dr.abs(v.z) / dr.two_pi
-        self.period = dr.rcp(larger(self.per_period, 1e-9))
+        self.longest = dr.rcp(k)
+        self.at_conjugate = AT_CONJUGATE * self.longest
+        self.turns = k * dr.abs(v.z) / dr.two_pi  # per cell
+        self.turn = dr.rcp(larger(self.turns, 1e-9))
         self.spread = sagitta * cone.spread
         self.width = dr.fma(self.spread, start, sagitta * cone.width)
         self.scale = 2 * dr.rcp(self.across)
@@ -185,17 +183,19 @@ class Chords:
     def after(self, t: mi.Float, cap: mi.Float = dr.inf) -> mi.Float:
         """The chord that starts at arc length ``t``, no longer than ``cap`` if that can be."""
         h = self.scale * (self.spread + self._root(self.room(t)))
-        return larger(smaller(smaller(h, self.longest), cap), self.shortest(t))
+        h = smaller(smaller(h, self.longest), self._near_conjugate(t))
+        return larger(smaller(h, cap), self.shortest(t))
 
     def shortest(self, t: mi.Float) -> mi.Float:
         """At least a few roundings of the arc length, so that every chord moves on."""
         return larger(self.least, 2**-21 * t)
 
-    def unfocused(self, t: mi.Float) -> mi.Float:
-        """The longest chord that starts at arc length ``t``, by the closest conjugate point."""
-        middle = dr.fma(0.5, self.at_focus, t)
-        focus = self.period * larger(dr.round(self.per_period * middle), 1)
-        return larger(TOWARDS_FOCUS * dr.abs(focus - middle), self.at_focus)
+    def _near_conjugate(self, t: mi.Float) -> mi.Float:
+        """The longest chord at arc length ``t``, by the closest end of a turn."""
+        # From the middle of the shortest one
+        middle = dr.fma(0.5, self.at_conjugate, t)
+        end = self.turn * larger(dr.round(self.turns * middle), 1)
+        return larger(TO_CONJUGATE * dr.abs(end - middle), self.at_conjugate)
 
     def between(self, t: mi.Float, remaining: mi.Float) -> mi.Float:
         """The chord that starts at ``t`` if the cone narrows again towards ``remaining``.
@@ -235,7 +235,6 @@ class Tracer:
         self.least = opaque(larger(1e-4, 16 * space.slack))
         self.overlap = opaque(2 * space.slack)  # of chords at their joints
         self.exact = opaque(larger(4e-6, 0.25 * space.slack))
-        self.longest = LONGEST_IN_CELL if space.quotient else LONGEST
         self.shapes = shapes = shapes or Shapes(scene)
         self.triangles = Triangles(shapes)
         self.clearance = None
@@ -517,7 +516,7 @@ class Tracer:
         quotient = space.quotient
         sagitta = dr.select(cone.soft, SOFT_SAGITTA, SAGITTA)
         start = dr.select(cone.soft, 0, START)
-        chords = Chords(v, k, cone, sagitta, start, self.least, self.longest)
+        chords = Chords(v, k, cone, sagitta, start, self.least)
         unit = random_of(p, v)
         front = self._start(p, p, v)
         chord = Chord(mi.Vector3f(0), mi.Float(0))
@@ -541,7 +540,6 @@ class Tracer:
                     front = self._leapt(front, chords, unit, cap, reach, searching & ~cone.soft)
                 left = reach - front.t
                 h = smaller(chords.after(front.t, cap), left)
-                h = smaller(h, chords.unfocused(front.t))
                 length = self._phased(front, h, unit)
                 lift = corner(smaller(h, STEEPEST * length))
                 length = smaller(length, left)
@@ -585,8 +583,9 @@ class Tracer:
                     found, o, d, distance, failed = self._onto_geodesic(
                         found, o, d, foot, distance, chord, cone, chords, reach, time
                     )
+                failed &= (front.t == 0) | (distance > chords.turn)
                 # A chord that cannot be cut any more is taken as it is
-                failed &= (front.t == 0) & (chord.length > 2 * chords.shortest(front.t))
+                failed &= chord.length > 2 * chords.shortest(front.t)
                 valid = ~failed
                 if failed:
                     front.foot = foot.moved(-s, k)
@@ -745,7 +744,7 @@ class Tracer:
         the front there, and the ray that has met it with what that is."""
         space, scene = self.space, self.scene
         quotient = space.quotient
-        chords = Chords(v, space.twist, cone, SHADOW_SAGITTA, 0, self.least, self.longest)
+        chords = Chords(v, space.twist, cone, SOFT_SAGITTA, 0, self.least)
         unit = random_of(p, v)
         front = self._start(start, p, v)
         blocked = mi.Bool(False)
@@ -761,7 +760,6 @@ class Tracer:
             while searching:
                 left = reach - front.t
                 h = smaller(chords.between(front.t, left), left)
-                h = smaller(h, chords.unfocused(front.t))
                 length = self._phased(front, h, unit)
                 last = length >= left
                 length = smaller(length, left)

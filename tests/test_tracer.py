@@ -135,7 +135,7 @@ def test_a_leap_that_rounding_takes_away_is_none(rgb, monkeypatch):
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2}})
     tracer = Tracer(scene, Space(1.0, False, [0] * 3, 1.0), dr.inf)
     p, v, t = mi.Point3f(0.1, 0, 0), mi.Vector3f(0, 0.6, 0.8), mi.Float(300)
-    chords = Chords(v, tracer.space.twist, Cone(), 1, 0, tracer.least, 1)
+    chords = Chords(v, tracer.space.twist, Cone(), 1, 0, tracer.least)
     # Just worth it, for a ray with a phase of a half
     free = 1.501 * LEAST_LEAP * chords.shortest(t)
     monkeypatch.setattr(Tracer, "_free", lambda *_: mi.Float(free))
@@ -143,6 +143,19 @@ def test_a_leap_that_rounding_takes_away_is_none(rgb, monkeypatch):
         front = Front(p, Foot(p, v, mi.Vector2f(0)), t, mi.Vector3i(0))
         front = tracer._leapt(front, chords, mi.Float(0.5), mi.Float(0), t + 1, mi.Bool(True))
     assert front.t[0] == 300
+
+
+@pytest.mark.parametrize("t", [1e4, 1e6])
+def test_every_chord_moves_on_also_near_a_conjugate_point(rgb, t):
+    """At twist 8 the shortest chord of a million cells is longer than any that is wanted there."""
+    from nil_mitsuba.tracer import Chords, Cone
+
+    mi = rgb
+    t = mi.Float(t) + dr.arange(mi.Float, 100) / 64
+    for remaining in (1, dr.inf):
+        chords = Chords(mi.Vector3f(0.6, 0, 0.8), mi.Float(8), Cone(0, 1e-3), 1, 0, mi.Float(1e-4))
+        length = chords.between(t, remaining)
+        assert dr.all((t + length) - t > 0)
 
 
 def test_chords_are_as_far_inside_of_the_curve_as_outside(rgb):
