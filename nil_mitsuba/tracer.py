@@ -33,10 +33,10 @@ from .quotient import Space, exit_through_face, into_cell, opaque, through_face
 from .shapes import Shapes
 from .triangles import Triangle, Triangles
 
-# A chord's sagitta is about this part of the cone's width there: along rays that are seen, and along
-# those behind rough bounces or towards lights. The first follows from how many rays name another
-# surface near silhouettes (benchmarks/camera_rays.py); the second is what the means and the shadows
-# of the bent Cornell box do not show (benchmarks/accuracy.py).
+# A chord's sagitta is about this part of the cone's width there: along rays that are seen, and
+# along those behind rough bounces or towards lights. The first follows from how many rays name
+# another surface near silhouettes (benchmarks/camera_rays.py); the second is what the means and the
+# shadows of the bent Cornell box do not show (benchmarks/accuracy.py).
 SAGITTA, SOFT_SAGITTA = 0.07, 0.2
 # Rays that are seen are allowed at their start what they are at this distance (cells): of the many
 # short chords there few meet anything. Beyond a twentieth of a cell that is within the tolerance.
@@ -487,7 +487,7 @@ class Tracer:
 
         In the quotient ``p`` lies in the first cell. A hit of a ray that is seen lies off the
         geodesic by at most 4e-6 cells and 1/250 of the cone; where the geodesic only just misses
-        what its chord meets, by the chord's error, which keeps within the cone.
+        what its chord meets, by the chord's error, about a tenth of the cone.
         """
         v = self.space.to_cell_axes(v)
         if self.space.flat and not self.space.quotient:
@@ -589,7 +589,7 @@ class Tracer:
                 valid = ~failed
                 if failed:
                     front.foot = foot.moved(-s, k)
-                    # A chord of an eighth has a 64th of the sagitta
+                    # A chord of an eighth has a 64th of the sagitta; a first one has its phase, too
                     cap = 0.125 * chord.length
             active &= ~valid & (front.t < reach)
 
