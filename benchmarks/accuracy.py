@@ -4,10 +4,10 @@ Of each scene: the mean's relative difference between renders of the same seeds,
 error; the share of paths that bring something else; and at 1,024 samples how many pixels, and how
 many squares of 4×4 pixels, in which smaller errors of neighbours add up, differ by more than noise.
 
-Constants are chosen on the Cornell box; the furnished cell has ruled out longer first chords and
-shown what chords need that a face has cut. The others are for stating what was reached: nothing is
-chosen by their images. All but the small lattice are full of contacts, creases and shadows, where
-errors show.
+Constants are chosen on the Cornell box; the furnished cell has had a say in those of first chords,
+of chords that a face has cut and of the longest ones, and single rays of the small lattice in those
+near conjugate points. The other two are for stating what was reached. All but the small lattice are
+full of contacts, creases and shadows, where errors show.
 """
 
 import argparse

@@ -515,8 +515,7 @@ class Tracer:
         k = space.twist
         quotient = space.quotient
         sagitta = dr.select(cone.soft, SOFT_SAGITTA, SAGITTA)
-        start = dr.select(cone.soft, 0, START)
-        chords = Chords(v, k, cone, sagitta, start, self.least)
+        chords = Chords(v, k, cone, sagitta, dr.select(cone.soft, 0, START), self.least)
         unit = random_of(p, v)
         front = self._start(p, p, v)
         chord = Chord(mi.Vector3f(0), mi.Float(0))

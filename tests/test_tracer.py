@@ -152,7 +152,7 @@ def test_every_chord_moves_on_also_near_a_conjugate_point(rgb, t):
 
     mi = rgb
     t = mi.Float(t) + dr.arange(mi.Float, 100) / 64
-    for remaining in (1, dr.inf):
+    for remaining in (1, 1e3):
         chords = Chords(mi.Vector3f(0.6, 0, 0.8), mi.Float(8), Cone(0, 1e-3), 1, 0, mi.Float(1e-4))
         length = chords.between(t, remaining)
         assert dr.all((t + length) - t > 0)
